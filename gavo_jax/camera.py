@@ -241,7 +241,7 @@ PRESETS = {
 dataset (Palazzolo et al. 2019) and of the rendered ICL-NUIM (Handa et al. 2014)."""
 
 
-NUMBERS_OF_DISTORTION = {"pinhole": (4, 5, 8, 12, 14), "fisheye": (4,)}
+DISTORTION_COUNTS = {"pinhole": (4, 5, 8, 12, 14), "fisheye": (4,)}
 """Numbers of distortion coefficients that OpenCV accepts, by model."""
 
 
@@ -258,9 +258,9 @@ def require_camera(camera: Camera) -> None:
             raise GavoError(f"camera: {name}: a {'positive ' * (least == 0)}number is needed, not {value!r}")
     if not (_is_number(camera.readout) and camera.readout >= 0):
         raise GavoError(f"camera: readout: seconds from 0 on are needed, not {camera.readout!r}")
-    if camera.model not in NUMBERS_OF_DISTORTION:
-        raise GavoError(f"camera: model: one of {', '.join(NUMBERS_OF_DISTORTION)} is needed, not {camera.model!r}")
-    counts, distortion = NUMBERS_OF_DISTORTION[camera.model], camera.distortion
+    if camera.model not in DISTORTION_COUNTS:
+        raise GavoError(f"camera: model: one of {', '.join(DISTORTION_COUNTS)} is needed, not {camera.model!r}")
+    counts, distortion = DISTORTION_COUNTS[camera.model], camera.distortion
     if not (isinstance(distortion, tuple) and len(distortion) in (0, *counts) and all(map(_is_number, distortion))):
         raise GavoError(
             f"camera: distortion: a tuple of {', '.join(map(str, counts))} numbers is needed, not {distortion!r}"

@@ -32,7 +32,7 @@ FAULTS = ("shifted", "mirrored", "upside down", "turned by half", *("of another 
 """Name of the fault by the placement that fits better: a shift, then each other way."""
 EVERY, SELDOM, EARLY = 3, 30, 24
 """One in `EVERY` of the first `EARLY` references is examined, one in `SELDOM` after them."""
-KEPT = 0.95
+SUM_DECAY = 0.95
 """Decay of the earlier sums with each reference that is added."""
 MIN_SEEN = 5
 """Number of frames that must be added before a fault is reported."""
@@ -70,7 +70,7 @@ class DepthEdges(NamedTuple):
         jumps = depth_jumps(np.asarray(frame.depth), camera)
         if np.mean(jumps) < FEWEST_JUMPS:
             return counted
-        sums = KEPT * self.sums + likeness(edges(np.asarray(frame.grey)), jumps)
+        sums = SUM_DECAY * self.sums + likeness(edges(np.asarray(frame.grey)), jumps)
         fault = fault_by(sums) if self.seen + 1 >= MIN_SEEN else ""
         return counted._replace(sums=sums, seen=self.seen + 1, fault=fault)
 

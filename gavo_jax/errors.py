@@ -45,7 +45,7 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
-def tell(line: str) -> None:
+def print_message(line: str) -> None:
     """Print a message of the command on standard error, always as a single line."""
     print(f"gavo: {printable(' '.join(line.split()))}", file=sys.stderr, flush=True)
 

@@ -28,7 +28,7 @@ REPROJECTION = 2.0
 ROUNDS = 2000
 """Largest number of RANSAC samples; it ends sooner once one is free of outliers with probability `CONFIDENCE`."""
 CONFIDENCE = 0.9999
-FEWEST = 6
+MIN_INLIERS = 6
 """Smallest number of inliers: two more than the four points that a motion is computed from."""
 REFINEMENTS = 3
 """Rounds of refining the motion on the inliers and choosing these anew."""
@@ -96,7 +96,7 @@ def match(reference: Features, target: Features) -> tuple[np.ndarray, np.ndarray
 def solve_motion(reference: Features, target: Features, camera: Camera) -> FeatureMotion | None:
     """Return the motion between two frames from their keypoints; None if it has too few inliers."""
     before, after = match(reference, target)
-    if len(before) < FEWEST:
+    if len(before) < MIN_INLIERS:
         return None
     points, pixels, matrix = reference.points[before], target.pixels[after], camera.rectified().matrix
     try:
@@ -116,7 +116,7 @@ def solve_motion(reference: Features, target: Features, camera: Camera) -> Featu
         return None
     chosen: np.ndarray = np.asarray(inliers)[:, 0]
     for _ in range(REFINEMENTS):
-        if len(chosen) < FEWEST:
+        if len(chosen) < MIN_INLIERS:
             return None
         rotation, translation = cv2.solvePnPRefineLM(
             points[chosen], pixels[chosen], matrix, None, rotation, translation
@@ -125,7 +125,7 @@ def solve_motion(reference: Features, target: Features, camera: Camera) -> Featu
         ahead = (points @ cv2.Rodrigues(rotation)[0].T + translation.T)[:, 2] > 0
         near = np.linalg.norm(projected[:, 0] - pixels, axis=1) < REPROJECTION
         chosen = np.flatnonzero(near & ahead)
-    if len(chosen) < FEWEST or not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+    if len(chosen) < MIN_INLIERS or not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         return None
     target_T_reference = np.eye(4)
     target_T_reference[:3, :3] = cv2.Rodrigues(rotation)[0]

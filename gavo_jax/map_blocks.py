@@ -16,7 +16,7 @@ BLOCK = 8
 """Voxels along the side of a block."""
 MOST_BLOCKS = 100_000
 """Largest number of blocks of a map, some 1 GB; with voxels of 1 cm about 300 m² of surface."""
-LOOKED_AT = 4
+SAMPLING_STRIDE = 4
 """Stride, along either axis, of the pixels that Open3D samples to find a frame's blocks."""
 MOST_ENLARGED = 16
 """Largest factor by which an image is enlarged so that no block lies between samples."""
@@ -32,8 +32,8 @@ def image_for_blocks(
         camera: The frame's camera, without distortion.
         voxel: Side of a voxel, metres.
     """
-    filled = with_looked_at_filled(metres)
-    apart = LOOKED_AT * float(metres.max()) / min(float(camera.fx), float(camera.fy))
+    filled = with_samples_filled(metres)
+    apart = SAMPLING_STRIDE * float(metres.max()) / min(float(camera.fx), float(camera.fy))
     times = min(MOST_ENLARGED, max(1, int(np.ceil(apart / (BLOCK * voxel)))))
     if times == 1:
         return filled, camera.matrix
@@ -42,12 +42,12 @@ def image_for_blocks(
     return np.repeat(np.repeat(filled, times, axis=0), times, axis=1), enlarged.matrix
 
 
-def with_looked_at_filled(metres: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+def with_samples_filled(metres: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Fill the pixels that Open3D samples, each fourth of each fourth row, from a reading near them.
 
     A sensor may leave out exactly those rows.
     """
-    filled, looked_at = metres.copy(), np.s_[::LOOKED_AT, ::LOOKED_AT]
-    near = cv2.dilate(metres, np.ones((2 * LOOKED_AT - 1,) * 2))[looked_at]
-    filled[looked_at] = np.where(metres[looked_at] > 0, metres[looked_at], near)
+    filled, samples = metres.copy(), np.s_[::SAMPLING_STRIDE, ::SAMPLING_STRIDE]
+    near = cv2.dilate(metres, np.ones((2 * SAMPLING_STRIDE - 1,) * 2))[samples]
+    filled[samples] = np.where(metres[samples] > 0, metres[samples], near)
     return filled

@@ -38,6 +38,11 @@ PAPER_OBJECTIVE = AlignmentOptions(
 """The paper's error on every pixel, searched in ξ itself. Two choices are not given in the paper. A candidate must keep
 half of the points in view. The bounds are ±6 cm and ±0.06 rad (3.4°) per gene about the guess at level 4, halved at
 each finer level about the last level's best."""
+HALF_SIZE_OBJECTIVE = AlignmentOptions(
+    points=(4800, 1200, 1200, 1200, 1200), depth_weight=(0.05, 0.05, 0.3, 0.3, 0.3), views=(1, 1, 1, 1, 1)
+)
+"""For pairs of images of half the size, without a third view. A level is the next coarser one of the whole images, so
+that level 0 is the odometry's finest."""
 
 
 def _paper_solver(method: str) -> Any:

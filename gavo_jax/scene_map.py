@@ -24,8 +24,8 @@ from gavo_jax.errors import GavoError, GavoWarning, partial_of
 from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.libusb import import_open3d
 from gavo_jax.map_blocks import BLOCK, MOST_BLOCKS, image_for_blocks
-from gavo_jax.odometry.drawn import AsTracked
 from gavo_jax.odometry.driver import Moving, Step, seen_moving
+from gavo_jax.odometry.overlays import AsTracked
 from gavo_jax.se3 import is_rigid
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory, inverse, stamp_name

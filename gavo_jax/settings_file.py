@@ -21,14 +21,14 @@ from gavo_jax.objective.losses import LOSSES
 from gavo_jax.settings import Settings
 from gavo_jax.settings_check import MAX_REAL, alternatives, is_whole, kind_of, require_settings
 
-ROOMS = tuple(field.name for field in dataclasses.fields(Settings))
+PARTS = tuple(field.name for field in dataclasses.fields(Settings))
 """Parts of the settings: the first components of dotted names."""
 OPTIMIZERS: dict[str, Callable[..., Any]] = {
     name: getattr(optax, name)
     for name in ("adabelief", "adam", "adamw", "amsgrad", "lion", "nadam", "radam", "rmsprop", "sgd", "yogi")
 }
 """Optimisers of optax that need nothing but a learning rate, by name."""
-CONFIG_KEYS = ("options", "sequence", *ROOMS, "device", "versions")
+CONFIG_KEYS = ("options", "sequence", *PARTS, "device", "versions")
 """Keys of a run's config.json."""
 MAX_FILE_BYTES = 2**20
 
@@ -59,15 +59,15 @@ def load_settings(path: str | Path, method: str = "ga", preset: str = "default")
     read = read_json_object if path.suffix == ".json" else read_toml
     table = read(path, MAX_FILE_BYTES)
     if path.suffix == ".json":
-        if not any(room in table for room in ROOMS):
-            raise GavoError(f"{path}: no settings: a run's config.json holds {', '.join(ROOMS)}")
+        if not any(part_name in table for part_name in PARTS):
+            raise GavoError(f"{path}: no settings: a run's config.json holds {', '.join(PARTS)}")
         refuse_unknown(str(path), table, CONFIG_KEYS)
         options = table.get("options")
         names = options if isinstance(options, dict) else {}
         table = {key: names[key] for key in ("method", "preset") if key in names} | {
-            room: _without_types(table.get(room, {})) for room in ROOMS
+            part_name: _without_types(table.get(part_name, {})) for part_name in PARTS
         }
-    refuse_unknown(str(path), table, ("method", "preset", *ROOMS))
+    refuse_unknown(str(path), table, ("method", "preset", *PARTS))
     method, preset = str(table.pop("method", method)), str(table.pop("preset", preset))
     refuse_unknown_method(f"{path}: method", method)
     refuse_unknown(f"{path}: preset", [preset], presets.PRESETS, "name")
@@ -95,10 +95,10 @@ def save_settings(path: str | Path, settings: Settings, method: str | None = Non
     if type(presets.preset(method, preset).solver) is not type(settings.solver):
         raise GavoError(f"{path}: method {method} is not that of a {type(settings.solver).__name__}")
     table: dict[str, Any] = {"method": method, "preset": preset}
-    for room in ROOMS:
-        part = getattr(settings, room)
+    for part_name in PARTS:
+        part = getattr(settings, part_name)
         values = {field.name: getattr(part, field.name) for field in dataclasses.fields(part) if field.repr}
-        table[room] = {name: _as_toml(f"{path}: {room}.{name}", value) for name, value in values.items()}
+        table[part_name] = {name: _as_toml(f"{path}: {part_name}.{name}", value) for name, value in values.items()}
     write_bytes(path, tomli_w.dumps(table).encode())
 
 
@@ -120,11 +120,11 @@ def assignments(texts: Iterable[str]) -> dict[str, Any]:
     return values
 
 
-def _without_types(room: Any) -> Any:
+def _without_types(part: Any) -> Any:
     """Convert a part of config.json to that of a settings file: without the type's name, and with a word for null."""
-    if not isinstance(room, dict):
-        return room
-    return {name: "none" if value is None else value for name, value in room.items() if name != "type"}
+    if not isinstance(part, dict):
+        return part
+    return {name: "none" if value is None else value for name, value in part.items() if name != "type"}
 
 
 def _as_toml(place: str, value: Any) -> Any:
@@ -185,21 +185,21 @@ def override(settings: Settings, values: Mapping[str, Any], place: str = "settin
     """
     before = settings
     for name, value in values.items():
-        room, _, rest = name.partition(".")
-        if room not in ROOMS:
-            _refuse_part(place, room, settings)
+        part_name, _, rest = name.partition(".")
+        if part_name not in PARTS:
+            _refuse_part(place, part_name, settings)
         if not rest:
-            raise GavoError(f"{place}: {room}: not a table of settings")
-        part = getattr(settings, room)
+            raise GavoError(f"{place}: {part_name}: not a table of settings")
+        part = getattr(settings, part_name)
         field, _, level = rest.partition(".")
-        refuse_unknown(f"{place}: {room}", [field], [f.name for f in dataclasses.fields(part) if f.repr])
+        refuse_unknown(f"{place}: {part_name}", [field], [f.name for f in dataclasses.fields(part) if f.repr])
         current = getattr(part, field)
         where = f"{place}: {name}"
         if level:
             new: Any = _with_level(where, current, level, value)
         else:
             new = _convert(where, type(part), field, current, value)
-        settings = dataclasses.replace(settings, **{room: dataclasses.replace(part, **{field: new})})
+        settings = dataclasses.replace(settings, **{part_name: dataclasses.replace(part, **{field: new})})
     require_settings(settings, place)
     _refuse_without_effect(before, settings, values, place)
     return settings
@@ -210,22 +210,22 @@ def _refuse_without_effect(before: Settings, after: Settings, values: Mapping[st
 
     Files that name every field (`save_settings`) are exempt: they also hold values without effect.
     """
-    for room in ROOMS:
-        part, earlier = getattr(after, room), getattr(before, room)
+    for part_name in PARTS:
+        part, earlier = getattr(after, part_name), getattr(before, part_name)
         fields = [field for field in dataclasses.fields(part) if field.repr]
-        if all(f"{room}.{field.name}" in values for field in fields):
+        if all(f"{part_name}.{field.name}" in values for field in fields):
             continue
         for field in fields:
-            name, other = f"{room}.{field.name}", field.metadata.get("instead_of")
+            name, other = f"{part_name}.{field.name}", field.metadata.get("instead_of")
             is_idle = other is not None and getattr(part, other) is not None
             if is_idle and name in values and getattr(part, field.name) != getattr(earlier, field.name):
-                raise GavoError(f"{place}: {name} counts only where {room}.{other} is none: set that instead")
+                raise GavoError(f"{place}: {name} counts only where {part_name}.{other} is none: set that instead")
 
 
 def takes_whole(settings: Settings, name: str) -> bool:
     """Whether a setting, by its dotted name, takes whole numbers."""
-    room, field, *_ = name.split(".")
-    part = getattr(settings, room)
+    part_name, field, *_ = name.split(".")
+    part = getattr(settings, part_name)
     return _takes_whole(type(part), field, getattr(part, field))
 
 
@@ -235,10 +235,9 @@ def _takes_whole(owner: type, field: str, current: Any) -> bool:
 
 def _refuse_part(place: str, name: str, settings: Settings) -> NoReturn:
     """Raise GavoError for a name that begins with no part of the settings, suggesting the nearest full name."""
-    parts = {room: [field.name for field in dataclasses.fields(getattr(settings, room))] for room in ROOMS}
-    whole = {field: f"{room}.{field}" for room, names in parts.items() for field in names} | {
-        room: room for room in ROOMS
-    }
+    parts = {part: [field.name for field in dataclasses.fields(getattr(settings, part))] for part in PARTS}
+    whole = {field: f"{part}.{field}" for part, names in parts.items() for field in names}
+    whole |= {part: part for part in PARTS}
     near = difflib.get_close_matches(name, whole, n=1, cutoff=0.0)[0]
     raise GavoError(f"{place}: unknown key {shown(name)}; did you mean {shown(whole[near])}?")
 

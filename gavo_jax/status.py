@@ -64,7 +64,7 @@ _SENTENCES = {
     AlignmentStatus.MOVING_BODY: "The motion may be that of a body that covers much of the image, not the camera's.",
 }
 
-GRAVITY = (
+BY_GRAVITY = (
     AlignmentStatus.AMBIGUOUS,
     AlignmentStatus.MOVING_BODY,
     AlignmentStatus.LOW_TEXTURE,
@@ -95,6 +95,6 @@ def as_findings(criteria: Mapping[AlignmentStatus, Any]) -> Any:
 def gravest(findings: Any) -> Any:
     """Return the gravest of several findings, as an integer."""
     status = jnp.int32(AlignmentStatus.OK)
-    for candidate in GRAVITY:
+    for candidate in BY_GRAVITY:
         status = jnp.where(findings & bit(candidate), jnp.int32(candidate), status)
     return status

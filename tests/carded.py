@@ -10,7 +10,7 @@ import numpy as np
 
 from gavo_jax.alignment.visits import prepare_target
 from gavo_jax.bodies.belief import Belief, form_belief
-from gavo_jax.bodies.evidence import View, view_of
+from gavo_jax.bodies.pixel_evidence import View, view_of
 from gavo_jax.bodies.scene import MotionSegmenter
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequence

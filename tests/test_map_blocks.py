@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small import CAMERA
 
-from gavo_jax.map_blocks import BLOCK, LOOKED_AT, image_for_blocks, with_looked_at_filled
+from gavo_jax.map_blocks import BLOCK, SAMPLING_STRIDE, image_for_blocks, with_samples_filled
 
 
 @pytest.mark.parametrize("stray", [False, True])
@@ -15,7 +15,7 @@ def test_open3d_finds_a_reading_where_it_looks(stray: bool) -> None:
     metres = np.full((40, 60), 2.0, np.float32)
     metres[::4] = 0.0
     metres[0, 0] = 3.0 * stray
-    filled = with_looked_at_filled(metres)
+    filled = with_samples_filled(metres)
     assert np.all(filled[::4, ::4] > 0) and filled[0, 0] == (3.0 if stray else 2.0)
     np.testing.assert_array_equal(filled[1], metres[1])
 
@@ -24,7 +24,7 @@ def test_open3d_finds_a_reading_where_it_looks(stray: bool) -> None:
 def test_no_block_lies_between_the_pixels_that_are_looked_at(voxel: float) -> None:
     metres = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32)
     seen, matrix = image_for_blocks(metres, CAMERA, voxel)
-    assert LOOKED_AT * 2.0 / matrix[0, 0] <= BLOCK * voxel
+    assert SAMPLING_STRIDE * 2.0 / matrix[0, 0] <= BLOCK * voxel
     ahead = np.array([0.3, -0.2, 1.0])
     (u, v), (column, row) = ((camera @ ahead)[:2] for camera in (CAMERA.matrix, matrix))
     times = seen.shape[1] / CAMERA.width  # the same place of the image, its pixels' middles at whole numbers

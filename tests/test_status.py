@@ -2,7 +2,7 @@
 
 import pytest
 
-from gavo_jax.status import GRAVITY, AlignmentStatus, as_findings, bit, gravest
+from gavo_jax.status import BY_GRAVITY, AlignmentStatus, as_findings, bit, gravest
 
 
 def test_statuses_say_a_sentence() -> None:
@@ -17,7 +17,7 @@ def test_every_status_is_a_bit_of_its_own() -> None:
     assert found == bit(AlignmentStatus.AMBIGUOUS)
 
 
-@pytest.mark.parametrize(("lighter", "graver"), list(zip(GRAVITY, GRAVITY[1:], strict=False)))
+@pytest.mark.parametrize(("lighter", "graver"), list(zip(BY_GRAVITY, BY_GRAVITY[1:], strict=False)))
 def test_of_two_findings_the_graver_is_the_status(lighter: AlignmentStatus, graver: AlignmentStatus) -> None:
     assert gravest(bit(lighter) | bit(graver)) == graver and gravest(bit(lighter)) == lighter
     assert gravest(0) == AlignmentStatus.OK

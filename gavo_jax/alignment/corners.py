@@ -14,7 +14,7 @@ from gavo_jax.camera import Camera, to_ray
 from gavo_jax.image.motion_compensation import filled_inverse_depth
 from gavo_jax.image.numbers import Depth, grey_bytes
 
-MOST = 500
+MAX_CORNERS = 500
 """Largest number of corners of a frame; the strongest are kept."""
 QUALITY = 0.005
 """Smallest response of a corner, as a share of the strongest one's."""
@@ -62,7 +62,8 @@ def track_corners(
     points = None
     is_corner = seen * (cv2.cornerMinEigenVal(grey, 3) > RESPONSE * LEAST_SLOPE**2).astype(np.uint8)
     if is_corner.any():
-        points = cv2.goodFeaturesToTrack(grey, MOST, QUALITY, max(1.0, SPACING * camera.width), mask=255 * is_corner)
+        spacing = max(1.0, SPACING * camera.width)
+        points = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, QUALITY, spacing, mask=255 * is_corner)
     if points is None:
         return Matches(np.zeros((0, 2)), np.zeros((0, 2)))
     there = cv2.remap(target, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

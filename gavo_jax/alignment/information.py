@@ -24,9 +24,9 @@ SIGNIFICANCE = 4.0
 MIN_ALIGNED_SHARE = 1e-3
 """Mean squared cosine between image gradients and a direction's flow below which its information counts as none.
 Interpolated gradients are wrong by two or three per cent, so that a stripe seems to constrain motion along itself."""
-ENOUGH = 4800
+SAMPLED_POINTS = 4800
 """Number of evenly spread points that the information is taken from if there are twice as many or more."""
-LEAST = 0.01
+MIN_INFORMATION = 0.01
 """Squared grey levels per m² or rad² below which information counts as none, whatever the number of points."""
 
 
@@ -53,7 +53,7 @@ def measure_information(problem: Problem, r: Residuals, terms: list[Term], is_bo
     are therefore also tested separately. For the whole image they are not: where grey settles on a wrong match, depth
     that determines the other directions would confirm it.
     """
-    objective, plane, every = problem.objective, problem.objective.plane, max(1, r.inside.shape[-1] // ENOUGH)
+    objective, plane, every = problem.objective, problem.objective.plane, max(1, r.inside.shape[-1] // SAMPLED_POINTS)
     factor = 2.0 * every / objective.divisor(jnp.sum(r.inside))
     reference, r, terms = jax.tree.map(lambda leaf: leaf[..., ::every], (objective.reference, r, terms))
     points = reference.points
@@ -77,7 +77,7 @@ def measure_information(problem: Problem, r: Residuals, terms: list[Term], is_bo
         along = weight * (before.along_inverse_depth**2).reshape(-1)
         possible += (flow_q * along) @ flow_q.T
         noise.append((weight, first, second))
-    directions = _whitening(possible + LEAST * jnp.eye(6))
+    directions = _whitening(possible + MIN_INFORMATION * jnp.eye(6))
     values, turn = jnp.linalg.eigh(directions.T @ sum(products) @ directions)
     directions = directions @ turn
     told = jnp.stack([jnp.sum(directions * (product @ directions), axis=0) for product in products])

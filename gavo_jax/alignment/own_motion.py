@@ -31,13 +31,13 @@ NOISE = 1.0
 """Lower bound on the reprojection error's scale, pixels."""
 INDEPENDENT = 4.0
 """Largest effective number of independent corners per frame, as whole surfaces share their errors (depth, blur)."""
-FEWEST = 20
+MIN_CORNERS = 20
 """Smallest number of corners for a result."""
 ROUNDS = 8
 LOOKS = 3
 """Number of first rounds in which depth is looked up anew."""
 
-Images = tuple[UInt8[np.ndarray, "h w"], Depth]
+GreyAndDepth = tuple[UInt8[np.ndarray, "h w"], Depth]
 
 
 class OwnMotion(NamedTuple):
@@ -50,8 +50,8 @@ class OwnMotion(NamedTuple):
 
 
 def refine_moving(
-    reference: Images,
-    target: Images,
+    reference: GreyAndDepth,
+    target: GreyAndDepth,
     camera: Camera,
     target_T_reference: Float[np.ndarray, "4 4"],
     delays: tuple[float, float] = (0.0, 0.0),
@@ -66,7 +66,7 @@ def refine_moving(
         delays: Seconds from each colour image's timestamp to its depth image's.
     """
     matches = track_corners(reference, target[0], target_T_reference, camera)
-    if len(matches.reference) < FEWEST:
+    if len(matches.reference) < MIN_CORNERS:
         return None
     frames = [
         _Side.of(pixels, images[1], camera, delay)
@@ -81,7 +81,7 @@ def refine_moving(
         if number < LOOKS:
             points = [frame.points(twist) for frame, twist in zip(frames, twists, strict=True)]
         residuals, slopes, known = _errors(frames, points, start @ _step(x[:6]), twists, camera)
-        if known.sum() < FEWEST:
+        if known.sum() < MIN_CORNERS:
             return None
         weights = known * _weights(np.linalg.norm(residuals, axis=1), known)
         counted = weights * min(1.0, 2.0 * INDEPENDENT / max(float(weights.sum()), 1e-9))

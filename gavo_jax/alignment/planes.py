@@ -9,19 +9,19 @@ from jaxtyping import Bool, Float, Float64
 
 from gavo_jax.camera import Camera, inverse_depth, to_ray
 
-MOST, LARGE = 3, 0.25
+MAX_PLANES, MIN_PLANE_SHARE = 3, 0.25
 """Largest number of planes, and the smallest share of the readings on each."""
 STEP = 5
 """Stride of the readings that planes are fitted to, in pixels of the reduced frame."""
 TRIES = 150
 """Random triples of readings per plane: a plane with a quarter of the readings is found in 9 of 10 frames."""
-NEAR = (0.01, 0.02)
+INLIER_TOLERANCE = (0.01, 0.02)
 """Largest distance of an inlier from a plane in inverse depth: 1/m, and as a share of the reading."""
 MIDDLE = (2.0, 98.0)
 """Percentiles, along either axis, of the part of a plane that a frontal view covers."""
 EVERY = 7
 """Stride of the pixels that determine which part of the plane is covered."""
-LEAST, NARROW = 16, 8
+MIN_COVERED_PIXELS, NARROW = 16, 8
 """Smallest number of these pixels, and smallest side of the view in pixels."""
 
 
@@ -97,8 +97,8 @@ def planes(frame: Small) -> list[Plane]:
     q = q[row, column]
     rays = np.stack([x[column], y[row], np.ones_like(q)], axis=-1)
     generator, left, found = np.random.default_rng(0), np.arange(len(q)), []
-    least = max(LARGE * len(q), 3)
-    while len(found) < MOST and len(left) >= least:
+    least = max(MIN_PLANE_SHARE * len(q), 3)
+    while len(found) < MAX_PLANES and len(left) >= least:
         slopes = _most_supported(rays[left], q[left], generator)
         of_it = left[_is_near(rays[left] @ slopes, q[left])]
         if len(of_it) < least:
@@ -111,7 +111,7 @@ def planes(frame: Small) -> list[Plane]:
 
 def _is_near(plane: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Whether inverse depths lie on a plane."""
-    return np.abs(plane - q) < np.maximum(NEAR[0], NEAR[1] * q)
+    return np.abs(plane - q) < np.maximum(INLIER_TOLERANCE[0], INLIER_TOLERANCE[1] * q)
 
 
 def _most_supported(
@@ -136,7 +136,7 @@ def seen_straight(frame: Small, plane: Plane) -> StraightView | None:
     inside = (expected > 0) & ((q == 0) | _is_near(expected, q))
     row, column = np.nonzero(inside)
     row, column = row[::EVERY], column[::EVERY]
-    if len(row) < LEAST:
+    if len(row) < MIN_COVERED_PIXELS:
         return None
     right, down = _axes(plane.normal)
     x, y = frame.slopes

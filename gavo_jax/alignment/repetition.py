@@ -27,7 +27,7 @@ AHEAD = 0.2
 """Cosine between the optical axis and a plane's normal above which the plane lies ahead."""
 QUICK, EXACT = 4, 2
 """Factors by which the image is reduced: for a quick test, and for the exact one if that is positive."""
-HINT = 0.3
+MIN_QUICK_CORRELATION = 0.3
 """Autocorrelation above which the quick test is positive; that one is not normalised by the overlap."""
 FAST = (1.0, 2.0)
 """m/s and rad/s of a fast hand."""
@@ -58,7 +58,7 @@ def repetitions(grey: Any, depth: Any, camera: Camera) -> list[tuple[Plane, Floa
 
 def _may_repeat(frame: Small, plane: Plane) -> bool:
     view = seen_straight(frame, plane)
-    return view is not None and len(_peaks(_self_likeness(view, exact=False), HINT)) > 0
+    return view is not None and len(_peaks(_self_likeness(view, exact=False), MIN_QUICK_CORRELATION)) > 0
 
 
 def _steps_along(plane: Plane, frame: Small) -> Float64[np.ndarray, "n 3"]:
@@ -159,7 +159,7 @@ quick test sees."""
 AS_GOOD, NOISE = 6.0, 4.0
 """Largest ratio of a repetition's difference to E for it to explain the images as well, and a lower bound on that E,
 squared grey levels, as interpolated images are inexact."""
-MOST = 8
+MAX_REPETITIONS = 8
 """Largest number of repetitions of each plane that are compared, the nearest ones."""
 
 
@@ -247,7 +247,7 @@ def _nearest(
     others: Float64[np.ndarray, "n 3"], step: Float64[np.ndarray, " 3"], reach: float
 ) -> Float64[np.ndarray, "k 3"]:
     away = np.linalg.norm(others - step, axis=1)
-    return others[np.argsort(away)][: np.count_nonzero(away < reach)][:MOST]
+    return others[np.argsort(away)][: np.count_nonzero(away < reach)][:MAX_REPETITIONS]
 
 
 def _is_any_as_good(

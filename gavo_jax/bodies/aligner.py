@@ -16,9 +16,9 @@ from gavo_jax.alignment.judgement import MIN_EXPLAINED_GREY, UNKNOWN
 from gavo_jax.alignment.result import with_finding
 from gavo_jax.bodies.belief import Belief, suspect
 from gavo_jax.bodies.consensus import Opinion
-from gavo_jax.bodies.evidence import inverse_depth_of
-from gavo_jax.bodies.identity import LEAST, BodyTracks, body_components
+from gavo_jax.bodies.identity import MIN_BODY_SHARE, BodyTracks, body_components
 from gavo_jax.bodies.motions import find_motions
+from gavo_jax.bodies.pixel_evidence import inverse_depth_of
 from gavo_jax.bodies.scene import AwareState, FrameView, MotionSegmenter
 from gavo_jax.bodies.surfaces import whole_surfaces
 from gavo_jax.datasets.base import Frame
@@ -35,9 +35,9 @@ MAJORITY = 0.5
 """Support above which a motion is accepted as the camera's although its points fit badly."""
 ROUNDS = 3
 """Maximum number of repeated searches, each without what moves according to the one before."""
-RELUCTANT = 2.0
+MAX_DISSENT_RATIO = 2.0
 """Ratio of a motion's dissent to the least dissent from any motion, above which another one is searched for."""
-BETTER = 1.2
+MIN_REPLACEMENT_RATIO = 1.2
 """Ratio of a motion's dissent to that from its replacement, from which on the replacement is taken."""
 MISTRUSTED, MISTRUSTED_BESIDE_BODIES = 18.0, 12.0
 """Dissents above which a motion may be a body's, without bodies in view and with some. With pure noise the median block
@@ -48,7 +48,7 @@ GAIN = 0.01
 """Gain in support that a round needs for another one to follow."""
 LARGE = 0.25
 """Share of the image covered by bodies above which the last motion may stand in for one that is not found."""
-MAX_CARRIED = 0.5
+MAX_SECONDS_EXTRAPOLATED = 0.5
 """Longest time, in seconds, for which the last motion may stand in for one that is not found."""
 NEARLY_AS_GOOD = 0.85
 """Support of another motion, relative to the best one's, above which it may be the camera's as well."""
@@ -60,19 +60,19 @@ MOST_ASIDE = 0.6
 """Largest share of the image that is set aside on suspicion; where more is suspected, only what moves is set aside."""
 SAME = (0.01, 0.01)
 """Metres and radians within which two motions are the same."""
-GOES_ON = (0.01, 0.01)
+MIN_VELOCITY_DEVIATIONS = (0.01, 0.01)
 """Least standard deviations, metres and radians, of the prior of constant velocity; larger where the run's velocity
 usually changes more.
 """
-SURPRISE = 22.5
+MAX_FUSION_DISTANCE = 22.5
 """Squared Mahalanobis distance between the motion found and the prediction above which the two are not fused.
 Chi-squared with six degrees of freedom exceeds it once in a thousand times.
 """
-FOUND = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
+ACCEPTABLE = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.AMBIGUOUS)
 """Statuses of a motion that may be considered as the camera's."""
 EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)
 """Findings that a body may cause by occluding points."""
-MOST = 0.9
+MIN_DEPTH_AGREEMENT = 0.9
 """Part of the image that neither moves nor is hidden whose depth has to agree with a motion for `DEPTH_MISMATCH` to
 be excused.
 """
@@ -88,7 +88,7 @@ class MotionCandidate(NamedTuple):
     @property
     def rank(self) -> tuple[bool, float]:
         """Sort key: the larger, the better."""
-        return self.attempt.result.status in FOUND, float(self.belief.support)
+        return self.attempt.result.status in ACCEPTABLE, float(self.belief.support)
 
 
 @dataclass(frozen=True)
@@ -151,16 +151,16 @@ class BodyAware:
         seen, look = self._agreed(state, frame, clock, first)
         depth_disagrees = AlignmentStatus.DEPTH_MISMATCH in seen.result.statuses
         found = _bodies(look.belief, before, depth_disagrees)
-        attempt, carried = seen, 0.0
+        attempt, seconds_extrapolated = seen, 0.0
         if not self.is_eager and self._asks(first, seen, found, before):
-            attempt, carried = self._asked(state, frame, clock, seen)
-        is_vague = attempt.usable and not carried and deviation(attempt) > GOES_ON[0]
+            attempt, seconds_extrapolated = self._asked(state, frame, clock, seen)
+        is_vague = attempt.usable and not seconds_extrapolated and deviation(attempt) > MIN_VELOCITY_DEVIATIONS[0]
         if not self.is_eager and is_vague and np.any(before):
             attempt = self._fused_with_prediction(state, clock, attempt)
         if attempt is not seen:
             look = self._look(state, attempt)
             found = _bodies(look.belief, before, depth_disagrees)
-        return self._remember(state, frame, clock, attempt, look, found, carried)
+        return self._remember(state, frame, clock, attempt, look, found, seconds_extrapolated)
 
     def _asks(
         self, first: Attempt, seen: Attempt, found: Integer[np.ndarray, "h w"], before: Bool[np.ndarray, "h w"]
@@ -183,8 +183,8 @@ class BodyAware:
 
         The time is in seconds; 0 where a motion was found.
         """
-        attempt, before = self._share_out(state, frame, clock, seen), state.scene.carried
-        if attempt.usable or not before < MAX_CARRIED:
+        attempt, before = self._share_out(state, frame, clock, seen), state.scene.seconds_extrapolated
+        if attempt.usable or not before < MAX_SECONDS_EXTRAPOLATED:
             return attempt, 0.0
         covered = float(np.mean(np.asarray(state.scene.tracks.labels) > 0))
         helped = self._helped_by_prediction(state, clock, attempt, covered)
@@ -198,7 +198,7 @@ class BodyAware:
         attempt: Attempt,
         look: FrameView,
         found: Integer[np.ndarray, "h w"],
-        carried: float,
+        seconds_extrapolated: float,
     ) -> Attempt:
         """Complete an attempt with its bodies and the state after it; nothing is learnt from a motion in doubt."""
         scene, segmenter = state.scene, self.segmenter
@@ -218,10 +218,11 @@ class BodyAware:
         whole, elapsed = tracker.previous, float(clock.elapsed)
         suspected = suspect(look.belief, bodies > 0, elapsed, trusted=not is_doubted)
         after = segmenter.renewed(scene, look, elapsed)._replace(
-            tracks=tracks, carried=np.asarray(carried, np.float32), suspected=suspected
+            tracks=tracks, seconds_extrapolated=np.asarray(seconds_extrapolated, np.float32), suspected=suspected
         )
-        if carried or (is_doubted and not self.is_eager):  # under a wrong motion the static scene seems to move
-            after = after._replace(known=look.belief.carried)
+        # under a wrong motion the static scene seems to move
+        if seconds_extrapolated or (is_doubted and not self.is_eager):
+            after = after._replace(known=look.belief.carried_belief)
         elif np.any(bodies != found):
             known = np.asarray(after.known)
             after = after._replace(known=np.where(bodies != found, np.maximum(known, 0.0), known))
@@ -239,13 +240,13 @@ class BodyAware:
         look = self._look(state, attempt)
         for _ in range(ROUNDS):
             opinion = look.opinion
-            if opinion is None or not float(opinion.dissent) > RELUCTANT * float(opinion.least):
+            if opinion is None or not float(opinion.dissent) > MAX_DISSENT_RATIO * float(opinion.least):
                 break
             again = self.search.align(self._without(state.tracker, opinion, clock), frame, clock)
             if not again.usable:
                 break
             other = self._look(state, again)
-            if other.opinion is None or BETTER * float(other.opinion.dissent) > float(opinion.dissent):
+            if other.opinion is None or MIN_REPLACEMENT_RATIO * float(other.opinion.dissent) > float(opinion.dissent):
                 break
             attempt, look = again, other
         return attempt, look
@@ -318,10 +319,10 @@ class BodyAware:
         found = np.asarray(attempt.result.target_T_reference)
         onward = log(inverse(found) @ self.predict(state, float(clock.elapsed)))
         changed = np.square(float(clock.elapsed)) * np.asarray(state.tracker.velocity_change.changes, np.float64)
-        prior = np.diag(np.repeat(np.maximum(changed, np.square(GOES_ON)), 3))
+        prior = np.diag(np.repeat(np.maximum(changed, np.square(MIN_VELOCITY_DEVIATIONS)), 3))
         covariance = np.float64(attempt.result.covariance)
         certainty = np.linalg.inv(covariance + prior)
-        if onward @ certainty @ onward > SURPRISE:
+        if onward @ certainty @ onward > MAX_FUSION_DISTANCE:
             return attempt
         share = covariance @ certainty
         motion = found @ exp(share @ onward)
@@ -363,9 +364,10 @@ def _judged(best: MotionCandidate, tried: list[MotionCandidate], known: bool) ->
     where more of the image contradicts it than supports it.
     """
     attempt, result, belief = best.attempt, best.attempt.result, best.belief
-    seen = known or float(belief.contradicted) > LEAST
+    seen = known or float(belief.contradicted) > MIN_BODY_SHARE
     in_view = 1.0 - np.mean((belief.moving > 0) | belief.hidden)
-    excused = EXCUSED if float(result.explained.depth) > MOST * in_view else bit(AlignmentStatus.HIGH_ERROR)
+    depth_agrees = float(result.explained.depth) > MIN_DEPTH_AGREEMENT * in_view
+    excused = EXCUSED if depth_agrees else bit(AlignmentStatus.HIGH_ERROR)
     matches = float(result.explained.grey) > MIN_EXPLAINED_GREY
     if seen and matches and float(belief.support) > MAJORITY and not int(result.findings) & ~excused:
         result = result._replace(status=AlignmentStatus.OK, findings=0)

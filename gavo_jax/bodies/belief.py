@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from gavo_jax.bodies.evidence import PixelEvidence, View, gather_evidence
+from gavo_jax.bodies.pixel_evidence import PixelEvidence, View, gather_evidence
 from gavo_jax.camera import Camera
 from gavo_jax.image.pyramid import halve_grey, halve_inverse_depth
 
-KEPT = 0.85
+BELIEF_DECAY = 0.85
 """Factor by which a belief decays per frame where nothing new is known."""
-NOTHING = 0.004
+MIN_MOVING_SHARE = 0.004
 """Share of the image known to move below which no body is looked for, as smoothing takes longer than all else."""
 FAR = 12.0
 """Depth evidence above which a pixel shows another surface, rather than the same one moved."""
@@ -51,7 +51,7 @@ class Belief(NamedTuple):
     """Share of what was known to be static that moves."""
     hidden: Bool[Array, "h w"]
     """Pixels that are occluded in the first of the other views."""
-    carried: Float[Array, "h w"]
+    carried_belief: Float[Array, "h w"]
     """Belief before this frame, carried over to the same surfaces."""
     suspected: Float[Array, "h w"]
     """How recently a body was seen on the pixel's surface, before this frame; from 0 to 1."""
@@ -86,10 +86,10 @@ def form_belief(
     moves, rests = _weigh(evidence)
     moves, rests = _box(moves), _box(rests)
     news = jnp.clip((moves - 0.25 - rests) * 4.0, -1.0, 1.0) * jnp.clip(moves + rests, 0.0, 1.0)
-    after = jnp.clip(KEPT * known + 0.5 * news, -1.0, 1.0)
+    after = jnp.clip(BELIEF_DECAY * known + 0.5 * news, -1.0, 1.0)
     grey = (here.image.grey & 255).astype(jnp.int32).astype(jnp.float32)
     moving = jax.lax.cond(
-        jnp.mean(jnp.maximum(after, 0.0)) > NOTHING,
+        jnp.mean(jnp.maximum(after, 0.0)) > MIN_MOVING_SHARE,
         lambda: share_out(after, grey, evidence.inverse_depth),
         lambda: -jnp.ones_like(after),
     )
@@ -104,7 +104,7 @@ def form_belief(
         support=jnp.sum(credit * at_rest) / total,
         contradicted=jnp.sum(credit * (moving > 0)) / total,
         hidden=hidden,
-        carried=known,
+        carried_belief=known,
         suspected=_after(suspected, evidence, grey) if carried and suspected is not None else jnp.zeros_like(after),
         in_view=jnp.sum(credit * evidence.seen, (1, 2)) / total,
     )
@@ -188,7 +188,7 @@ DEPTH_EDGE = 0.015
 """Relative step of inverse depth across which neighbours are hardly tied."""
 GREY_EDGE = 25.0
 """Step of grey, grey levels, across which neighbours are hardly tied where depth is missing."""
-ALIKE, HALF_KNOWN = 0.3, 0.03
+NO_DEPTH_TIE, HALF_DEPTH_TIE = 0.3, 0.03
 """Ties of neighbours that both lack depth, and of neighbours of which one has it: a body ends where its depth does."""
 
 
@@ -245,7 +245,7 @@ def _links(grey: Float[Array, "h w"], q: Float[Array, "h w"]) -> tuple[Float[Arr
         both = (q > 0) & (after_q > 0)
         nearest = jnp.maximum(jnp.maximum(q, after_q), 1e-3)
         by_depth = jnp.exp(-(((q - after_q) / (DEPTH_EDGE * nearest + 0.003)) ** 2))
-        alike = jnp.where((q > 0) == (after_q > 0), ALIKE, HALF_KNOWN)
+        alike = jnp.where((q > 0) == (after_q > 0), NO_DEPTH_TIE, HALF_DEPTH_TIE)
         by_grey = alike * jnp.exp(-(((grey - after_grey) / GREY_EDGE) ** 2))
         place = jax.lax.broadcasted_iota(jnp.int32, q.shape, axis)
         return jnp.where(place < q.shape[axis] - 1, jnp.where(both, by_depth, by_grey) + 1e-3, 0.0)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from gavo_jax.bodies.evidence import View, compare
+from gavo_jax.bodies.pixel_evidence import View, compare
 from gavo_jax.camera import Camera
 from gavo_jax.image.levels import image_plane
 from gavo_jax.image.warp import Slopes

@@ -168,7 +168,7 @@ class Duel:
         return int(self.age.frames) >= FRAMES and self._contradicts and self.certainty > DOUBTFUL
 
     @property
-    def is_lost(self) -> bool:
+    def is_rival_unsupported(self) -> bool:
         """Whether nothing speaks for the rival, after some time."""
         age = float(self.age.seconds)
         are_one = age >= AGREED_AFTER and not self.motions.have_parted()

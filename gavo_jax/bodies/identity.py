@@ -9,21 +9,21 @@ from jaxtyping import Bool, Float, Int32, Integer
 
 from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS
 
-LEAST = 0.008
+MIN_BODY_SHARE = 0.008
 """Smallest share of the image that a body covers."""
-SHOWS = 0.03
+MIN_NEW_EVIDENCE = 0.03
 """Evidence above which a component is a new body: summed belief that its pixels move, as a share of the image."""
-EXPLAINS = 0.015
+MIN_EXPLAINING_EVIDENCE = 0.015
 """Evidence that suffices for the largest component where depth disagrees with the motion found: a body would explain
 that.
 """
-KEEPS = 0.006
+MIN_KNOWN_EVIDENCE = 0.006
 """Evidence that suffices for a body known from the last frame."""
 THICK = 6 / 160
 """Radius, over the image's width, of a disc that has to fit inside a new body."""
-MOST = 8
+MAX_BODIES = 8
 """Maximum number of bodies at a time; the largest ones are kept."""
-UNSEEN = 15
+MAX_UNSEEN = 15
 """Frames after which an unseen body is forgotten."""
 
 
@@ -48,10 +48,10 @@ class BodyTracks(NamedTuple):
         """No known bodies, for an image of some height and width."""
         return cls(
             np.zeros(size, np.int32),
-            np.zeros(MOST, np.int32),
-            np.zeros(MOST, np.int32),
-            np.zeros((MOST, 6), np.float32),
-            np.full(MOST, UNKNOWN_SECONDS, np.float32),
+            np.zeros(MAX_BODIES, np.int32),
+            np.zeros(MAX_BODIES, np.int32),
+            np.zeros((MAX_BODIES, 6), np.float32),
+            np.full(MAX_BODIES, UNKNOWN_SECONDS, np.float32),
             np.int32(0),  # pyright: ignore[reportArgumentType]
         )
 
@@ -75,20 +75,21 @@ def body_components(
     """
     mask = moving > 0
     labels = np.zeros(mask.shape, np.int32)
-    if mask.mean() < LEAST:
+    if mask.mean() < MIN_BODY_SHARE:
         return labels
     found = 0
     count, split, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     depth = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
     thick = THICK * mask.shape[1]
     for k in np.argsort(-stats[1:, cv2.CC_STAT_AREA]) + 1:
-        if stats[k, cv2.CC_STAT_AREA] < LEAST * mask.size or found == MOST:
+        if stats[k, cv2.CC_STAT_AREA] < MIN_BODY_SHARE * mask.size or found == MAX_BODIES:
             break
         part = split == k
         was_known = np.mean(before[part]) > 0.3
         evidence = np.sum(np.maximum(known[part], 0.0)) / mask.size
-        shows = EXPLAINS if depth_disagrees and found == 0 else SHOWS
-        if depth[part].max() > (0.5 * thick if was_known else thick) and evidence > (KEEPS if was_known else shows):
+        least = MIN_EXPLAINING_EVIDENCE if depth_disagrees and found == 0 else MIN_NEW_EVIDENCE
+        least = MIN_KNOWN_EVIDENCE if was_known else least
+        if depth[part].max() > (0.5 * thick if was_known else thick) and evidence > least:
             found += 1
             labels[part] = found
     return labels
@@ -104,13 +105,13 @@ def associate(found: Integer[np.ndarray, "h w"], tracks: BodyTracks) -> BodyTrac
     given = _numbers(found, tracks)
     seen = given[1:]
     labels = given[found]
-    lasting = [i for i, n in enumerate(tracks.numbers) if n > 0 and n not in seen and tracks.ages[i] < UNSEEN]
+    lasting = [i for i, n in enumerate(tracks.numbers) if n > 0 and n not in seen and tracks.ages[i] < MAX_UNSEEN]
     for i in lasting:  # hidden, or at rest for a moment: expected where it was last seen
         labels = np.where((labels == 0) & (tracks.labels == tracks.numbers[i]), tracks.numbers[i], labels)
     last = np.int32(max(int(tracks.last), *given))
     after = BodyTracks.empty((labels.shape[0], labels.shape[1]))._replace(labels=labels, last=last)  # pyright: ignore[reportArgumentType]
     entries = [(n, 0) for n in seen] + [(tracks.numbers[i], tracks.ages[i] + 1) for i in lasting]
-    for place, (number, age) in enumerate(entries[:MOST]):
+    for place, (number, age) in enumerate(entries[:MAX_BODIES]):
         after.numbers[place], after.ages[place] = number, age
         for old in np.flatnonzero(tracks.numbers == number):
             after.motions[place], after.seconds[place] = tracks.motions[old], tracks.seconds[old]

@@ -19,8 +19,8 @@ from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.bodies.aligner import BodyAware, deviation, mistrusted
 from gavo_jax.bodies.duel import BEGUN, DROPPED_AFTER, EXACT, OVER, Duel, Motions, Span, leads
-from gavo_jax.bodies.evidence import View, inverse_depth_of
 from gavo_jax.bodies.identity import BodyTracks
+from gavo_jax.bodies.pixel_evidence import View, inverse_depth_of
 from gavo_jax.bodies.scene import AwareState
 from gavo_jax.bodies.surfaces import nearer_part
 from gavo_jax.bodies.votes import vote
@@ -154,7 +154,7 @@ class WithRival:
             return self._taken(other, rival, open_for, open_after)
         if duel.casts_doubt:
             attempt = mistrusted(attempt)
-        if duel.is_lost:
+        if duel.is_rival_unsupported:
             return attempt._replace(state=self._alone(attempt.state, open_after))
         if duel.is_given_up:
             return attempt._replace(state=self._alone(attempt.state, open_for))
@@ -221,7 +221,7 @@ class WithRival:
             known=np.asarray(near, np.float32),  # pyright: ignore[reportArgumentType]
             suspected=np.asarray(near, np.float32),
             tracks=tracks,
-            carried=np.zeros((), np.float32),
+            seconds_extrapolated=np.zeros((), np.float32),
         )
         tracker = state.tracker._replace(keyframe=state.tracker.previous, usual=Usual.unknown())
         seen = state._replace(tracker=segmenter.without(tracker, near), scene=scene)

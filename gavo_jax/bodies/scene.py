@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float, Integer
 from gavo_jax.alignment.visits import levels_of
 from gavo_jax.bodies.belief import Belief, form_belief
 from gavo_jax.bodies.consensus import Opinion, ask_area, has_blocks
-from gavo_jax.bodies.evidence import View, seen_level, view_of
 from gavo_jax.bodies.identity import BodyTracks
 from gavo_jax.bodies.masking import without_points
+from gavo_jax.bodies.pixel_evidence import View, seen_level, view_of
 from gavo_jax.camera import Camera
 from gavo_jax.compilation.programs import CachedProgram
 from gavo_jax.image.levels import ImagePlane, Levels
@@ -47,7 +47,7 @@ class Scene(NamedTuple):
     """Motions from the last frame's camera into those of `views`."""
     age: Float[np.ndarray, ""]
     """Age of the middle view, seconds."""
-    carried: Float[np.ndarray, ""]
+    seconds_extrapolated: Float[np.ndarray, ""]
     """Seconds for which the last motion has stood in for one that was not found."""
 
 

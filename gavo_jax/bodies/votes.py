@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from gavo_jax.bodies.consensus import LEAST_DEPTH, LEAST_GREY, STRIDE, block_sums, median_by_bisection, surface_area
-from gavo_jax.bodies.evidence import View, compare
+from gavo_jax.bodies.pixel_evidence import View, compare
 from gavo_jax.camera import Camera
 from gavo_jax.compilation.programs import CachedProgram
 

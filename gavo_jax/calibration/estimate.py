@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Integer
 
 from gavo_jax.calibration.pairs import Kinematics, Matched, Stretch, Unknowns, match_pairs
-from gavo_jax.calibration.scan import Least, Score, coarse, refine
+from gavo_jax.calibration.scan import Minimum, Score, coarse, refine
 from gavo_jax.camera import Camera
 from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
@@ -191,19 +191,19 @@ def estimate_camera(
     if pairs < LEAST_FRAMES // 2:
         raise GavoError(f"{sequence.name}: only {pairs} pairs of frames can be aligned: nothing can be found from them")
     interval = min(float(np.median(np.diff(times))) for times in stamps)
-    leasts: dict[str, Least] = {}
+    minima: dict[str, Minimum] = {}
     for number in range(rounds):
         for name, find in _STAGES.items():
             if name in wanted:
                 on_progress(f"{name.replace('_', ' ')}, round {number + 1} of {rounds}")
-                leasts |= find(trial, interval, number == 0)
+                minima |= find(trial, interval, number == 0)
                 trial.settle()
-    found |= _judged(leasts, trial, interval, guessed)
+    found |= _judged(minima, trial, interval, guessed)
     delay = found["depth_delay"].value if "depth_delay" in found else None
     return CameraEstimate(found, _with_found(sequence, found), delay or 0.0, pairs)
 
 
-def _find_readout(trial: _Trial, interval: float, is_first: bool) -> dict[str, Least]:
+def _find_readout(trial: _Trial, interval: float, is_first: bool) -> dict[str, Minimum]:
     most = min(interval, LONGEST_READOUT)
     score = trial.score("grey", lambda unknowns, value: unknowns._replace(readout=value))
     start = coarse(score, np.linspace(0, most, 7)) if is_first else float(trial.unknowns.readout)
@@ -213,7 +213,7 @@ def _find_readout(trial: _Trial, interval: float, is_first: bool) -> dict[str, L
     return {"readout": least}
 
 
-def _find_delay(trial: _Trial, interval: float, is_first: bool) -> dict[str, Least]:
+def _find_delay(trial: _Trial, interval: float, is_first: bool) -> dict[str, Minimum]:
     del interval
     score = trial.score("depth", lambda unknowns, value: unknowns._replace(delay=value))
     grid = np.arange(-LONGEST_DELAY, LONGEST_DELAY + 1e-9, 2 * DELAY_STEP)
@@ -224,7 +224,7 @@ def _find_delay(trial: _Trial, interval: float, is_first: bool) -> dict[str, Lea
     return {"depth_delay": least}
 
 
-def _find_focal(trial: _Trial, interval: float, is_first: bool) -> dict[str, Least]:
+def _find_focal(trial: _Trial, interval: float, is_first: bool) -> dict[str, Minimum]:
     """Scale both focal lengths by one factor: their ratio is that of the pixels, which is known better beforehand."""
     del interval
     said, ratio = trial.camera.fx, trial.camera.fy / trial.camera.fx
@@ -238,14 +238,14 @@ def _find_focal(trial: _Trial, interval: float, is_first: bool) -> dict[str, Lea
     least = refine(score, start, FOCAL_STEP, 1 - FOCAL_RANGE, 1 + FOCAL_RANGE)
     trial.unknowns = change(trial.unknowns, least.value)
     return {
-        "fx": Least(least.value * said, least.deviation * said),
-        "fy": Least(least.value * said * ratio, least.deviation * said * ratio),
+        "fx": Minimum(least.value * said, least.deviation * said),
+        "fy": Minimum(least.value * said * ratio, least.deviation * said * ratio),
     }
 
 
-def _find_centre(trial: _Trial, interval: float, is_first: bool) -> dict[str, Least]:
+def _find_centre(trial: _Trial, interval: float, is_first: bool) -> dict[str, Minimum]:
     del interval, is_first
-    leasts, apart = {}, trial.apart(APART)
+    minima, apart = {}, trial.apart(APART)
     for name in ("cx", "cy"):
         said, now = getattr(trial.camera, name), float(getattr(trial.unknowns, name))
 
@@ -254,11 +254,11 @@ def _find_centre(trial: _Trial, interval: float, is_first: bool) -> dict[str, Le
 
         least = refine(apart.score("grey", change), now, CENTRE_STEP, said - CENTRE_RANGE, said + CENTRE_RANGE)
         trial.unknowns = apart.unknowns = change(trial.unknowns, least.value)
-        leasts[name] = least
-    return leasts
+        minima[name] = least
+    return minima
 
 
-_STAGES: dict[str, Callable[[_Trial, float, bool], dict[str, Least]]] = {
+_STAGES: dict[str, Callable[[_Trial, float, bool], dict[str, Minimum]]] = {
     "readout": _find_readout,
     "depth_delay": _find_delay,
     "focal_length": _find_focal,
@@ -276,17 +276,17 @@ _KINDS: dict[str, tuple[str, str, str]] = {
 }
 
 
-def _judged(leasts: dict[str, Least], trial: _Trial, interval: float, guessed: str) -> dict[str, Found]:
+def _judged(minima: dict[str, Minimum], trial: _Trial, interval: float, guessed: str) -> dict[str, Found]:
     """Return each parameter with its deviation, or why it is not determined.
 
     Args:
-        leasts: Minima by name.
+        minima: Minima by name.
         trial: Trial that they were found with.
         interval: Time between two frames, seconds: no readout is longer.
         guessed: Origin of the stamps if they are a guess; else empty.
     """
     found = {}
-    for name, least in leasts.items():
+    for name, least in minima.items():
         kind, unit, how = _KINDS[name]
         if name == "readout" and least.value >= interval:
             how += "; at the longest that it can be, the time between two frames"

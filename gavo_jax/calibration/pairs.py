@@ -19,22 +19,19 @@ from gavo_jax.alignment.search import align_views
 from gavo_jax.alignment.visits import levels_of, prepare_target, stack_levels
 from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.datasets.base import Frame
-from gavo_jax.image.pyramid import LEVELS, PyramidLevel, build_pyramid, halve_grey, halve_inverse_depth
+from gavo_jax.image.pyramid import PyramidLevel, build_pyramid, halve_grey, halve_inverse_depth
 from gavo_jax.image.sampling import Target
 from gavo_jax.image.warp import Points, moved
 from gavo_jax.objective.estimates import estimate_scales
 from gavo_jax.objective.points import Reference, make_references, undo_rolling_shutter
+from gavo_jax.presets import HALF_SIZE_OBJECTIVE
 from gavo_jax.se3 import exp, log, rigid_inverse
-from gavo_jax.settings import AlignmentOptions
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus
 
 SOLVER = GaussNewton(iterations=(6, 6, 8, 8, 0))
-OPTIONS = AlignmentOptions(
-    points=(4800, 1200, 1200, 1200, 1200), views=(1,) * LEVELS, depth_weight=(0.05, 0.05, 0.3, 0.3, 0.3)
-)
-"""Options for frame to frame alignment: a keyframe would carry assumptions about the camera from pair to pair. Level 0
-is that of half-size images, the odometry's finest."""
+"""Solver of a pair, with `HALF_SIZE_OBJECTIVE`. A keyframe as another view would carry assumptions about the camera
+from pair to pair."""
 
 
 class Unknowns(NamedTuple):
@@ -185,7 +182,7 @@ def match_pairs(stretch: Stretch, kinematics: Kinematics, unknowns: Unknowns, *,
         camera: Camera of the full images; only its size matters.
     """
     seen = unknowns.on(camera).level(1)
-    levels = levels_of(seen, SOLVER, OPTIONS)
+    levels = levels_of(seen, SOLVER, HALF_SIZE_OBJECTIVE)
 
     def prepare(frame: Array) -> tuple[Reference, Target]:
         late = stretch.delays[frame] + unknowns.delay
@@ -209,10 +206,12 @@ def match_pairs(stretch: Stretch, kinematics: Kinematics, unknowns: Unknowns, *,
         reference = undo_rolling_shutter(reference, (kinematics.between[first] - gained) * unknowns.readout)
         share = unknowns.readout / (stretch.stamps[first + 1] - stretch.stamps[first])
         key, guess = jax.random.key(0), kinematics.guesses[first][None]
-        found, _ = align_views((reference,), target, seen, levels, SOLVER, OPTIONS, key, guess, readout=share)
-        visits = stack_levels((reference,), seen, levels, OPTIONS, None, share)
+        found, _ = align_views(
+            (reference,), target, seen, levels, SOLVER, HALF_SIZE_OBJECTIVE, key, guess, readout=share
+        )
+        visits = stack_levels((reference,), seen, levels, HALF_SIZE_OBJECTIVE, None, share)
         finest = jax.tree.map(lambda leaf: leaf[-1], visits)
-        objective, _ = fit_objective(finest, target, OPTIONS, found.target_T_reference)
+        objective, _ = fit_objective(finest, target, HALF_SIZE_OBJECTIVE, found.target_T_reference)
         scales = estimate_scales(objective.residuals(found.target_T_reference), finest.depth_weight)
         usable = (found.status == int(AlignmentStatus.OK)).astype(jnp.float32)
         return Matched(jnp.log(scales.grey), jnp.log(scales.depth), found.xi, found.target_T_reference, usable)

@@ -16,7 +16,7 @@ POINTS = 5
 """Number of evenly spaced values that a parabola is fitted to."""
 
 
-class Least(NamedTuple):
+class Minimum(NamedTuple):
     """Minimum of a function."""
 
     value: float
@@ -30,7 +30,7 @@ def coarse(score: Score, values: Float[np.ndarray, " n"]) -> float:
     return float(values[np.argmin(costs[:, counted].mean(axis=1))]) if counted.any() else float(np.median(values))
 
 
-def refine(score: Score, start: float, step: float, low: float, high: float, rounds: int = 3) -> Least:
+def refine(score: Score, start: float, step: float, low: float, high: float, rounds: int = 3) -> Minimum:
     """Find the minimum near a value, by parabolas through evenly spaced values that are re-centred on it.
 
     Args:
@@ -42,18 +42,18 @@ def refine(score: Score, start: float, step: float, low: float, high: float, rou
         rounds: largest number of times that the values are re-centred.
     """
     reach = step * (POINTS // 2)
-    middle, least = float(np.clip(start, low + reach, high - reach)), Least(start, np.inf)
+    middle, least = float(np.clip(start, low + reach, high - reach)), Minimum(start, np.inf)
     for _ in range(rounds):
         values = middle + step * (np.arange(POINTS) - POINTS // 2)
         costs, counted = _evaluate(score, values)
         if not counted.any():
-            return Least(middle, np.inf)
+            return Minimum(middle, np.inf)
         means = costs[:, counted].mean(axis=1)
         vertex = _vertex(values, means)
         if vertex is not None and low <= vertex <= high:
-            least = Least(vertex, _deviation(values, costs[:, counted]))
+            least = Minimum(vertex, _deviation(values, costs[:, counted]))
         else:
-            least = Least(float(values[np.argmin(means)]), np.inf)
+            least = Minimum(float(values[np.argmin(means)]), np.inf)
         moved = float(np.clip(least.value, max(middle, low + 2 * reach) - reach, min(middle, high - 2 * reach) + reach))
         if abs(moved - middle) < 0.5 * step:
             break

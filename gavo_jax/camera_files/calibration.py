@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.camera import MAX_SIDE, MIN_SIDE, NUMBERS_OF_DISTORTION, PRESETS, Camera
+from gavo_jax.camera import DISTORTION_COUNTS, MAX_SIDE, MIN_SIDE, PRESETS, Camera
 from gavo_jax.camera_files.makes import PARSERS, PROJECTION, Table
 from gavo_jax.camera_files.words import CAMERA_KEYS, DEVICE_KEYS, MODELS, REQUIRED, model_of
 from gavo_jax.errors import GavoError, read_text, shown
@@ -244,7 +244,7 @@ def _distortion(path: Path | str, part: str, values: Table) -> tuple[tuple[float
     if model is None:
         raise GavoError(f"{path}: {part}model: {shown(given)} is none of {', '.join(MODELS)}")
     numbers = values.get("distortion", [])
-    lengths = (0, *NUMBERS_OF_DISTORTION[model])
+    lengths = (0, *DISTORTION_COUNTS[model])
     if not isinstance(numbers, list) or len(numbers) not in lengths or ("distortion" in values and numbers == []):
         wanted = (
             "4 numbers (k1 k2 k3 k4)"

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax.camera_files.words import Table, beside
+from gavo_jax.camera_files.words import Table, rest_of_camera
 from gavo_jax.errors import GavoError, shown
 
 Rays = tuple[np.ndarray, np.ndarray]
@@ -82,7 +82,7 @@ def read_realsense(path: Path, values: Table) -> Table:
     table = {ours: values[theirs] for ours, theirs in names.items()}
     distortion = values.get("distortion")  # its model by librealsense's own names, or the coefficients
     model = values.get("model", distortion if isinstance(distortion, str) else values.get("distortion_model", "none"))
-    told = beside(str(path), {key: value for key, value in values.items() if not isinstance(value, str)})
+    told = rest_of_camera(str(path), {key: value for key, value in values.items() if not isinstance(value, str)})
     coefficients = told.pop("distortion", None) or [0.0] * 5
     if model == "none" and any(coefficients):
         raise GavoError(f"{path}: coefficients of a lens, and no model of it: one of {', '.join(LENSES)}")
@@ -174,7 +174,7 @@ def _nerf_cameras(values: Table) -> list[Table]:
 OPENLORIS_COLOR = "d400_color_optical_frame"
 """The colour camera among the sensors of OpenLORIS-Scene's robots, to which `aligned_depth` is registered."""
 
-SQUARE = 0.05
+MAX_FOCAL_DIFFERENCE = 0.05
 """Largest relative difference of OpenLORIS's fx and fy; more means that the numbers are in another order."""
 
 
@@ -189,9 +189,9 @@ def read_openloris(path: Path, values: Table) -> Table:
     if camera.get("model") != "pinhole":
         raise GavoError(f"{path}: {OPENLORIS_COLOR}: model {shown(camera.get('model'))}: pinhole is the only one")
     ((fx, cx, fy, cy),) = camera["intrinsics"]
-    if abs(fx - fy) > SQUARE * fx:
+    if abs(fx - fy) > MAX_FOCAL_DIFFERENCE * fx:
         raise GavoError(f"{path}: {OPENLORIS_COLOR}: {fx:g} {cx:g} {fy:g} {cy:g}: hardly fx cx fy cy, in that order")
-    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **beside(str(path), camera)}
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **rest_of_camera(str(path), camera)}
 
 
 def _whole(value: Any) -> Any:

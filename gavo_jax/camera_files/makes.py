@@ -21,7 +21,16 @@ from gavo_jax.camera_files.exports import (
     read_realsense,
 )
 from gavo_jax.camera_files.storage import read_storage, real_of, values_of
-from gavo_jax.camera_files.words import CAMERA_KEYS, DEVICE_KEYS, FOCAL, MATRIX, beside, first, known, numbers_of
+from gavo_jax.camera_files.words import (
+    CAMERA_KEYS,
+    DEVICE_KEYS,
+    FOCAL,
+    MATRIX,
+    first,
+    known,
+    numbers_of,
+    rest_of_camera,
+)
 from gavo_jax.errors import GavoError, line_of, number, parse_json, parse_toml, shown
 
 PROJECTION = "projection_matrix"
@@ -33,12 +42,12 @@ NESTED = ("camera", "cam", "camera_params", "cam_params")
 SAME_CAMERA = 0.5
 """Largest difference (pixels) between a scan's colour and depth intrinsics if depth is registered."""
 
-WIDEST_HALF, SQUARE = 1.5, (0.67, 1.5)
+WIDEST_HALF, FOCAL_RATIOS = 1.5, (0.67, 1.5)
 """Limits for a row of unnamed numbers: principal point over focal length, and the range of fx / fy.
 
 Beyond them the numbers are in another order."""
 
-ALIKE = 0.03
+FOCAL_TOLERANCE = 0.03
 """Largest usual difference between fx and fy, as a share of fx."""
 
 MOST_SKEW = 0.5
@@ -128,14 +137,14 @@ def _read_open3d(path: Path, values: Table) -> Table:
     """Looks like Open3D's intrinsics."""
     values = {**values, **values.get("intrinsic", {})}
     size = {"width": values["width"], "height": values["height"]}
-    return {**of_matrix(str(path), values["intrinsic_matrix"]), **size, **beside(str(path), values)}
+    return {**of_matrix(str(path), values["intrinsic_matrix"]), **size, **rest_of_camera(str(path), values)}
 
 
 def _read_nested(path: Path, values: Table) -> Table:
     """Looks like Replica's cam_params."""
     camera = next(values[name] for name in NESTED if isinstance(values.get(name), dict))
     unit = {"depth_scale": camera["scale"]} if "scale" in camera else {}
-    return {**{key: camera[key] for key in FOCAL}, **beside(str(path), {**camera, **unit})}
+    return {**{key: camera[key] for key in FOCAL}, **rest_of_camera(str(path), {**camera, **unit})}
 
 
 def _read_ros(path: Path, values: Table) -> Table:
@@ -147,7 +156,7 @@ def _read_ros(path: Path, values: Table) -> Table:
         )
     return {
         **of_matrix(str(path), numbers_of(first(values, MATRIX))),
-        **beside(str(path), values),
+        **rest_of_camera(str(path), values),
         PROJECTION: numbers_of(first(values, ("projectionmatrix", "p"))),
     }
 
@@ -171,19 +180,19 @@ def _kalibr_camera(path: Path, values: Table) -> Table:
         raise GavoError(f"{path}: camera_model {shown(values['camera_model'])}: pinhole is the only one that is read")
     (fx, fy, cx, cy), (width, height) = values["intrinsics"], values["resolution"]
     size = {"width": width, "height": height}
-    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **size, **beside(str(path), values)}
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **size, **rest_of_camera(str(path), values)}
 
 
 def _read_vins(path: Path, values: Table) -> Table:
     """Looks like a camera of VINS."""
-    return {**{key: values["projection_parameters"][key] for key in FOCAL}, **beside(str(path), values)}
+    return {**{key: values["projection_parameters"][key] for key in FOCAL}, **rest_of_camera(str(path), values)}
 
 
 def _read_flat(path: Path, values: Table) -> Table:
     """Looks like a camera of single numbers."""
     ours = {key: value for key, value in values.items() if key in CAMERA_KEYS + DEVICE_KEYS or not known(key)}
     others = {key: value for key, value in values.items() if key not in ours}
-    return {**ours, **beside(str(path), others)}
+    return {**ours, **rest_of_camera(str(path), others)}
 
 
 def _is_open3d(values: Table) -> bool:
@@ -340,8 +349,8 @@ def _with_size(path: Path, row: list[float]) -> Table:
 
 def _check_order(path: Path, fx: float, fy: float, cx: float, cy: float) -> None:
     is_wide = cx > fx * WIDEST_HALF or cy > abs(fy) * WIDEST_HALF
-    is_turned = abs(cx - fx) < ALIKE * fx and abs(fy - fx) > 5 * ALIKE * fx  # fx cx fy cy
-    if is_turned or is_wide or not SQUARE[0] * abs(fy) < fx < SQUARE[1] * abs(fy):
+    is_turned = abs(cx - fx) < FOCAL_TOLERANCE * fx and abs(fy - fx) > 5 * FOCAL_TOLERANCE * fx  # fx cx fy cy
+    if is_turned or is_wide or not FOCAL_RATIOS[0] * abs(fy) < fx < FOCAL_RATIOS[1] * abs(fy):
         raise GavoError(f"{path}: {fx:g} {fy:g} {cx:g} {cy:g}: hardly fx fy cx cy, in that order")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax.camera import NUMBERS_OF_DISTORTION
+from gavo_jax.camera import DISTORTION_COUNTS
 from gavo_jax.errors import GavoError
 
 Table = dict[str, Any]
@@ -44,7 +44,7 @@ UNIT = ("depthscale", "depthfactor", "pngdepthscale", "depthmapfactor")
 WIDTH, HEIGHT, SIZE = ("width", "imagewidth", "w"), ("height", "imageheight", "h"), ("imagesize", "resolution")
 """Names of the image's width, of its height and of both, pixels."""
 
-KEPT = ("readout", "depth_delay")
+COPIED_KEYS = ("readout", "depth_delay")
 """Keys that are read unchanged, as in our own files."""
 
 LEAST_UNITS = 0.05
@@ -99,8 +99,8 @@ def numbers_of(entry: Any) -> list[Any]:
     return flat
 
 
-def beside(place: str, values: Table) -> Table:
-    """Read size, lens, depth unit and `KEPT` keys, everything but the camera matrix, into our keys.
+def rest_of_camera(place: str, values: Table) -> Table:
+    """Read size, lens, depth unit and `COPIED_KEYS` keys, everything but the camera matrix, into our keys.
 
     Args:
         place: names the file in messages.
@@ -110,13 +110,14 @@ def beside(place: str, values: Table) -> Table:
         GavoError: an unknown name looks like distortion or a depth unit.
     """
     _refuse_unknown(place, values)
-    return {**_size(values), **_lens(values), **_unit(values), **{key: values[key] for key in KEPT if key in values}}
+    copied = {key: values[key] for key in COPIED_KEYS if key in values}
+    return {**_size(values), **_lens(values), **_unit(values), **copied}
 
 
 def known(key: str) -> bool:
-    """Whether `beside` reads a name."""
+    """Whether `rest_of_camera` reads a name."""
     words = (*LENS, *LENS_MODEL, *ANY_MODEL, *IS_FISHEYE, *UNIT, *WIDTH, *HEIGHT, *SIZE, *ORDER["pinhole"])
-    return plain(key) in words or key in KEPT
+    return plain(key) in words or key in COPIED_KEYS
 
 
 def camera_info_distortion(model: str, coefficients: list[Any]) -> Table:
@@ -146,7 +147,7 @@ def _by_name(values: Table, model: Any) -> list[Any]:
     kind = model_of(model) or "pinhole"
     found = {plain(key): value for key, value in values.items() if value is not None}
     last = max((at for at, name in enumerate(ORDER[kind]) if name in found), default=-1)
-    count = next(count for count in (0, *NUMBERS_OF_DISTORTION[kind]) if count > last)
+    count = next(count for count in (0, *DISTORTION_COUNTS[kind]) if count > last)
     return [found.get(name, 0.0) for name in ORDER[kind][:count]]
 
 

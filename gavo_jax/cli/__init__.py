@@ -19,7 +19,7 @@ from gavo_jax.cli.usage import HelpPage, asking_for_help, empty_argument, fault_
 from gavo_jax.compilation import compiler
 from gavo_jax.compilation.precision import choose_usual
 from gavo_jax.early import INTERRUPTED
-from gavo_jax.errors import GavoError, GavoWarning, shown, tell
+from gavo_jax.errors import GavoError, GavoWarning, print_message, shown
 from gavo_jax.version import __version__
 
 BAD_INPUT, BROKEN_PIPE = 2, 141
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _stop(words: str) -> int:
     interrupts.ignore()
-    tell(f"interrupted{words}")
+    print_message(f"interrupted{words}")
     return INTERRUPTED
 
 
@@ -96,7 +96,7 @@ def _told_warnings() -> Iterator[None]:
 
     def show_line(message: Any, category: type[Warning], *where: Any) -> None:
         if issubclass(category, GavoWarning):
-            tell(f"warning: {message}")
+            print_message(f"warning: {message}")
         else:
             show(message, category, *where)
 
@@ -168,5 +168,5 @@ def _silence_output() -> None:
 
 
 def _refuse(message: str) -> int:
-    tell(message)
+    print_message(message)
     return BAD_INPUT

@@ -39,7 +39,7 @@ def calibrate(options: Calibrate) -> int:
     with waiting("looking at the frames …"):
         estimate = interruptible(lambda: estimate_camera(sequence, wanted))
     calibration = calibration_of(sequence, estimate)
-    estimate = replace(estimate, found=in_all(estimate.found, calibration.depth_delay))
+    estimate = replace(estimate, found=with_total_delay(estimate.found, calibration.depth_delay))
     write_camera_file(output, calibration, ("found from the images alone by gavo calibrate", *_comments(estimate)))
     if options.json:
         print(json_text(_facts(estimate)))
@@ -67,7 +67,7 @@ def calibration_of(sequence: Sequence, estimate: CameraEstimate) -> Calibration:
     return replace(before.with_color(replace(before.color, **values)), depth_delay=delay)
 
 
-def in_all(found: dict[str, Found], depth_delay: float) -> dict[str, Found]:
+def with_total_delay(found: dict[str, Found], depth_delay: float) -> dict[str, Found]:
     """Return the estimates with the total depth delay; the estimate itself is relative to the delay already known."""
     beyond = found.get("depth_delay")
     if beyond is None or beyond.value is None or beyond.value == depth_delay:

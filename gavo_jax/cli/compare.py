@@ -15,7 +15,7 @@ from gavo_jax.cli.selection import open_sequence
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED
-from gavo_jax.errors import GavoError, tell
+from gavo_jax.errors import GavoError, print_message
 from gavo_jax.inspection import left_out_in_short, summary
 from gavo_jax.locks import hold
 from gavo_jax.odometry.driver import Odometry
@@ -61,9 +61,9 @@ COLUMNS = (
     ("frames/s", FRAMES_PER_SECOND, 1),
 )
 """Columns of the table: heading, key in comparison.json, decimals. The errors per frame stand in for the drift."""
-OF_PATH = ("path m", "end m: x y z")
+PATH_COLUMNS = ("path m", "end m: x y z")
 """Columns shown when no errors are known."""
-HEADINGS = ("method", *OF_PATH, *(heading for heading, _, _ in COLUMNS), "seeds", "m/s from", "to")
+HEADINGS = ("method", *PATH_COLUMNS, *(heading for heading, _, _ in COLUMNS), "seeds", "m/s from", "to")
 TABLE_CAPTION = (
     "Each method's run of median drift. m/s and deg/s: drift, the relative pose error over 1 s, root mean square (TUM "
     "evaluate_rpe.py, fixed delta). m/frame: the same from frame to frame, in place of the drift. ATE: root "
@@ -74,8 +74,8 @@ TABLE_CAPTION = (
     "included."
 )
 MEANINGS = {
-    OF_PATH[0]: "path: its length",
-    OF_PATH[1]: "end: position seen from the first frame, x right, y down, z forward",
+    PATH_COLUMNS[0]: "path: its length",
+    PATH_COLUMNS[1]: "end: position seen from the first frame, x right, y down, z forward",
     "m/s": "m/s, deg/s: drift, the relative pose error over 1 s",
     "m/frame": "m/frame: relative pose error from frame to frame",
     "ATE m": "ATE: absolute error after alignment",
@@ -128,7 +128,7 @@ def compare(options: Compare) -> int:
         cut_short = f"interrupted: {len(entries)} of {planned} runs were done" if status == INTERRUPTED else ""
         _write(options, sequence, entries, folder, cut_short)
         if cut_short:
-            tell(cut_short)
+            print_message(cut_short)
     say(f"files in {folder}")
     return status
 
@@ -193,7 +193,7 @@ def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: P
 
 def _print(title: str, rows: list[list[Any]], seeds: int, cost: str) -> None:
     """Print the table, with the columns about seeds only if there are several; `cost` names the work besides poses."""
-    shown = len(HEADINGS) if seeds > 1 else 1 + len(OF_PATH) + len(COLUMNS)
+    shown = len(HEADINGS) if seeds > 1 else 1 + len(PATH_COLUMNS) + len(COLUMNS)
     columns, cells = known_columns(HEADINGS[:shown], [row[:shown] for row in rows])
     print_table(title, columns, cells)
     for heading, meaning in MEANINGS.items():
@@ -313,6 +313,6 @@ def _rows(entries: list[Entry], typical: list[Entry]) -> list[list[Any]]:
         span = [number(extreme(known, default=None)) for extreme in (min, max)]
         path, end = path_and_end(run.trajectory)
         is_all = run.metrics[DRIFT_PER_FRAME] is None
-        of_path = [number(path), end or DASH] if is_all else [DASH] * len(OF_PATH)
+        of_path = [number(path), end or DASH] if is_all else [DASH] * len(PATH_COLUMNS)
         rows.append([run.label, *of_path, *cells, len(drifts), *span])
     return rows

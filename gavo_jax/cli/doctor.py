@@ -21,7 +21,7 @@ from gavo_jax.output.screen import say
 from gavo_jax.selfcheck import checks
 from gavo_jax.version import __version__
 
-OFF = 1
+CHECK_FAILED = 1
 """Exit status if a check fails."""
 NOT_INSTALLED = "not installed"
 PACKAGES = ("jax", "jaxlib", "numpy", "opencv-python-headless")
@@ -58,7 +58,7 @@ def doctor(command: Doctor) -> int:
         faults.append("packages that bring methods or datasets")
     faults += interruptible(_print_checks)
     say("all is well" if not faults else f"not as it should be: {', '.join(faults)}")
-    return OFF if faults else 0
+    return CHECK_FAILED if faults else 0
 
 
 def _print_checks() -> list[str]:

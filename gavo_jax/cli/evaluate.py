@@ -10,7 +10,7 @@ import numpy as np
 from gavo_jax.cli.options import Evaluate
 from gavo_jax.datasets.clocks import INTERVALS
 from gavo_jax.datasets.truth import counted_in
-from gavo_jax.errors import GavoError, tell
+from gavo_jax.errors import GavoError, print_message
 from gavo_jax.evaluation import (
     MAX_DIFFERENCE,
     ErrorSeries,
@@ -28,7 +28,7 @@ from gavo_jax.trajectory import Trajectory, associate
 UNITS = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
 """Units, in seconds, that timestamps may have instead of seconds."""
 
-ALIKE = 0.1
+DURATION_TOLERANCE = 0.1
 """Relative difference in duration below which two trajectories are taken to be of one recording."""
 
 
@@ -44,7 +44,7 @@ def evaluate(options: Evaluate) -> int:
         print(json.dumps({**span, **figures}, indent=2))
     else:
         _print(options, series)
-    note = tell if options.json else say  # beside the JSON, not in it
+    note = print_message if options.json else say  # beside the JSON, not in it
     for words in (*missing, *_remarks(paths, read)):
         note(words)
     if options.plot is not None:
@@ -124,7 +124,7 @@ def _check_units(estimate: np.ndarray, truth: np.ndarray) -> None:
         if min(len(stamps), len(others)) < 2:
             return
         for unit, name in UNITS.items():
-            is_alike = abs(unit * np.ptp(stamps) / np.ptp(others) - 1) < ALIKE or not _meet(stamps, others)
+            is_alike = abs(unit * np.ptp(stamps) / np.ptp(others) - 1) < DURATION_TOLERANCE or not _meet(stamps, others)
             if is_alike and _meet(unit * stamps, others) and unit * np.median(np.diff(stamps)) > INTERVALS[0]:
                 raise GavoError(
                     f"the stamps of the {whose} look like {name}, the other ones like seconds: write both so"

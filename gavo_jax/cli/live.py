@@ -20,7 +20,7 @@ from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.live.devices import open_device
 from gavo_jax.datasets.live.frames import LiveDevice, LiveImages, Newest, frame_of
 from gavo_jax.early import INTERRUPTED, LOST
-from gavo_jax.errors import GavoError, tell
+from gavo_jax.errors import GavoError, print_message
 from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.metrics import run_identity
@@ -141,7 +141,7 @@ def _track(
     except KeyboardInterrupt:
         if count < 2:
             raise
-        tell(f"{newest.device.name}: interrupted after {count} frames")
+        print_message(f"{newest.device.name}: interrupted after {count} frames")
         interrupted = True
     except GavoError as error:  # keep what was tracked so far
         if count < 2:

@@ -22,7 +22,7 @@ from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.live.devices import is_live
 from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED, LOST
-from gavo_jax.errors import tell
+from gavo_jax.errors import print_message
 from gavo_jax.evaluation import is_w_first
 from gavo_jax.inspection import left_out, left_out_in_short, summary
 from gavo_jax.interrupts import interruptible
@@ -82,7 +82,7 @@ def run(options: Run) -> int:
         metrics, interrupted = folder.finished() if options.resume else None, False
         if metrics is not None:
             shown = "" if options.viewer == "none" else f"; gavo view {folder.path} shows it"
-            tell(f"{folder.path}: the run came to its end before: nothing to resume{shown}")
+            print_message(f"{folder.path}: the run came to its end before: nothing to resume{shown}")
         else:
             # before an earlier run is replaced, as opening may fail
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
@@ -135,7 +135,7 @@ def _go_on(
     for step in (None, *steps):
         viewer.watch(None, step)
     if mapper is not None:
-        mapper.replay(sequence, steps, folder.moving, progress.drawn.is_any)
+        mapper.replay(sequence, steps, folder.moving, progress.overlays.is_any)
 
 
 def _configuration(options: Run, sequence: Sequence, settings: Settings) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from gavo_jax.cli.options import Source, View
 from gavo_jax.cli.readiness import be_ready
 from gavo_jax.cli.selection import open_sequence
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.errors import GavoError, tell
+from gavo_jax.errors import GavoError, print_message
 from gavo_jax.interrupts import interruptible
 from gavo_jax.locks import hold
 from gavo_jax.odometry.driver import Odometry, Step
@@ -59,7 +59,7 @@ def _find_search(run: RecordedRun, folder: Path, sequence: Sequence) -> Odometry
         seed = int(run.config["options"]["seed"])
         return Odometry(sequence.camera, settings, seed=seed, record=True)
     except (GavoError, KeyError, TypeError, ValueError) as error:
-        tell(f"without the search: {error}")
+        print_message(f"without the search: {error}")
         return None
 
 
@@ -83,7 +83,8 @@ def _show_with_search(
                 apart = max(apart, float(np.linalg.norm(np.asarray(now - before)[:3, 3])))
             bar.advance()
     if apart > SAME:
-        tell(f"the search, done once more, comes out up to {1e3 * apart:.1f} mm elsewhere than that of the run")
+        off = f"{1e3 * apart:.1f} mm"
+        print_message(f"the search, done once more, comes out up to {off} elsewhere than that of the run")
 
 
 def _is_of_the_search(step: Step) -> bool:
@@ -113,7 +114,7 @@ def _find_sequence(run: RecordedRun, folder: Path) -> Sequence | None:
             raise GavoError(f"{source.sequence}: holds other frames than those of the run")
         return sequence
     except GavoError as error:
-        tell(f"without images and truth: {error}")
+        print_message(f"without images and truth: {error}")
         return None
 
 

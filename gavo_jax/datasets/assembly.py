@@ -24,7 +24,7 @@ FINE, COARSE = 5000.0, 1000.0
 FARTHEST_FINE = 12.0
 """Farthest readings, metres, for which the finer unit is used: 16 bits hold 13.1 m of it."""
 
-MUCH = 0.02
+MAX_EXCESS_SHARE = 0.02
 """Share of an image that may exceed its scale without a warning."""
 
 METRES, MILLIMETRES = 1.0, 1000.0
@@ -204,7 +204,7 @@ class FrameAssembler:
             stamped = timestamp if depth_timestamp is None else depth_timestamp
             depth_timestamp = stamped + self.calibration.depth_delay
         _check_size(bgr, self.calibration.color, name, "camera")
-        if bgr.dtype != np.uint8 and np.mean(bgr > self.white) > MUCH:
+        if bgr.dtype != np.uint8 and np.mean(bgr > self.white) > MAX_EXCESS_SHARE:
             brighter = "is brighter than the images that were looked at first"
             self._tell_once(brighter, name, f"what exceeds {self.white} is white, in others too")
         image = _binned(to_8_bits(bgr, self.white), self.binning)
@@ -235,7 +235,7 @@ class FrameAssembler:
             )
         if depth.raw.dtype != np.uint16:
             farthest = NO_READING / self.unit.frame
-            if np.mean(np.isfinite(depth.raw) & (depth.raw > farthest * self.unit.file)) > MUCH:
+            if np.mean(np.isfinite(depth.raw) & (depth.raw > farthest * self.unit.file)) > MAX_EXCESS_SHARE:
                 so = f"depth beyond {farthest:.3g} m is left out, of others too"
                 self._tell_once("reaches further than frames of this source hold", depth.name, so)
         return in_frame_units(depth.raw, self.unit)

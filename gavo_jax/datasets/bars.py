@@ -9,11 +9,11 @@ import numpy as np
 
 DARKEST = 20
 """Grey level of the brightest bar."""
-ALIKE = 1
+MAX_BAR_CONTRAST = 1
 """Largest difference of the pixels in a bar, grey levels."""
-LEAST = 4
+MIN_BAR_WIDTH = 4
 """Minimum width of a bar, pixels."""
-MOST = 0.5
+MAX_BAR_SHARE = 0.5
 """Largest share of a side that bars may take; beyond it the image is taken for blank and left as it is."""
 RIM = 4
 """Pixels beside a bar that compression or scaling has blended with it."""
@@ -42,14 +42,14 @@ def _inside(image: Any) -> slice:
     """Rows between the bars and their rims."""
     size = len(image)
     first, last = _margin(image), _margin(image[::-1])
-    return slice(0, size) if first + last > MOST * size else slice(first, size - last)
+    return slice(0, size) if first + last > MAX_BAR_SHARE * size else slice(first, size - last)
 
 
 def _margin(image: Any) -> int:
     """Number of rows of a bar and its rim, from the first row on; dark rows after the rim belong to the bar."""
-    searched = image[: int(MOST * len(image)) + 1]
+    searched = image[: int(MAX_BAR_SHARE * len(image)) + 1]
     end = _bar(searched)
-    if end < LEAST:
+    if end < MIN_BAR_WIDTH:
         return 0
     while more := _bar(searched[end + RIM :]):
         end += RIM + more
@@ -61,6 +61,6 @@ def _bar(image: Any) -> int:
     darkest, brightest = np.inf, -np.inf
     for count, row in enumerate(image):
         darkest, brightest = min(darkest, float(np.min(row))), max(float(np.max(row)), brightest)
-        if not (brightest <= DARKEST and brightest - darkest <= ALIKE):  # NaN is no bar
+        if not (brightest <= DARKEST and brightest - darkest <= MAX_BAR_CONTRAST):  # NaN is no bar
             return count
     return len(image)

@@ -24,7 +24,7 @@ SHIFTED, TENTHS = 8000.0, 10000.0
 CENTIMETRES = 100.0
 """Centimetres, in units per metre: proposed only if the steps match or the median is implausible."""
 
-LOOKED_AT = 3
+SAMPLED_FRAMES = 3
 """Number of frames that are sampled."""
 
 KINECTS = ("fr1", "fr2", "fr3", "bonn")
@@ -190,7 +190,7 @@ def _as_shares(sample: DepthSample, scale: float) -> str:
 def lack_of_depth(sequence: FrameSequence) -> str | None:
     """Describe why a sequence has no depth; None if any of its first, middle and last frames has a reading."""
     read = _reader_of(sequence)
-    places = sorted({*range(min(LOOKED_AT, len(sequence))), len(sequence) // 2, len(sequence) - 1})
+    places = sorted({*range(min(SAMPLED_FRAMES, len(sequence))), len(sequence) // 2, len(sequence) - 1})
     looked = recorded = 0
     for index in places:
         try:
@@ -220,7 +220,7 @@ def sample_sequence(sequence: FrameSequence) -> tuple[DepthSample | None, float]
     read = _reader_of(sequence)
     unit = getattr(sequence, "depth_unit", None)
     images = []
-    for index in range(min(LOOKED_AT, len(sequence))):
+    for index in range(min(SAMPLED_FRAMES, len(sequence))):
         try:
             images.append(read(index))
         except FrameError:

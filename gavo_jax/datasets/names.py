@@ -192,7 +192,7 @@ def _stamps(names: Sequence[str], unit: float | None) -> Stamps | None:
     return Stamps(seconds) if seconds else _counts(names, unit)
 
 
-def form(name: str) -> str:
+def mask_numbers(name: str) -> str:
     """A name with its numbers masked; only long ones keep their length, so that stamps of one clock have one form."""
     return re.sub(r"\d+", lambda digits: "0" * (len(digits[0]) if len(digits[0]) >= DIGITS_OF_A_CLOCK else 1), name)
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.datasets.clocks import TICK, UNITS, clock_unit, in_seconds, unit_of
-from gavo_jax.datasets.names import FEWEST, form
+from gavo_jax.datasets.names import FEWEST, mask_numbers
 from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.se3 import rigid
 from gavo_jax.trajectory import MAX_MAGNITUDE, SHORTEST_QUATERNION, Trajectory, rotation_from_quaternion
@@ -159,7 +159,7 @@ def unread_truth(folder: Path, truth: Trajectory | None, estimates: str = "") ->
     ]
     alike: dict[str, list[str]] = {}
     for name in others:
-        alike.setdefault(form(name), []).append(name)
+        alike.setdefault(mask_numbers(name), []).append(name)
     return [f"{name}: {NO_TRUTH}" for name in sorted(found)] + [_how_to_name(folder, names) for names in alike.values()]
 
 

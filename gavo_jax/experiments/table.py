@@ -47,7 +47,7 @@ if it is in one; `finished` is in UTC."""
 
 
 MAPPINGS = ("configuration", "versions")
-NEEDED = ("sequence", "method", "label", "lost_pairs", FRAMES_PER_SECOND, "runs_together", "pixels", *MAPPINGS)
+NON_NULL = ("sequence", "method", "label", "lost_pairs", FRAMES_PER_SECOND, "runs_together", "pixels", *MAPPINGS)
 """Columns that have a value in every row."""
 
 
@@ -113,7 +113,7 @@ def _fault(rows: list[dict[str, Any]], run: str) -> str:
     (row,) = rows
     if row["run"] != run:
         return "of another run than its name says"
-    for name in NEEDED:
+    for name in NON_NULL:
         if row[name] is None:
             return f"without {name}"
     if not row[FRAMES_PER_SECOND] > 0:

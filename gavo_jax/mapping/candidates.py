@@ -11,9 +11,9 @@ from gavo_jax.mapping.keyframes import Keyframe
 from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.trajectory import inverse
 
-MOST = 4
+MAX_CANDIDATES = 4
 """Maximum number of candidates per keyframe, which bounds the work."""
-LOOKED_AT = 48
+MAX_COMPARED = 48
 """Maximum number of earlier keyframes compared with a new one, those that see most of the same; it bounds the work."""
 FEW_POINTS = 60
 """About how many of the new keyframe's points are used to choose the earlier ones."""
@@ -47,7 +47,9 @@ class LoopCandidate(NamedTuple):
 
 
 def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> list[LoopCandidate]:
-    """Find a keyframe's candidates among earlier ones that have their images: at most `MOST`, the most similar first.
+    """Find a keyframe's candidates among earlier ones that have their images.
+
+    There are at most `MAX_CANDIDATES`, the most similar first.
 
     Args:
         new: The later keyframe.
@@ -69,7 +71,7 @@ def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> li
     for candidate in possible:
         if all(abs(candidate.earlier.number - chosen.earlier.number) >= APART for chosen in found):
             found.append(candidate)
-    return found[:MOST]
+    return found[:MAX_CANDIDATES]
 
 
 def _most_overlapping(new: Keyframe, others: list[Keyframe], camera: Camera) -> list[Keyframe]:
@@ -83,7 +85,7 @@ def _most_overlapping(new: Keyframe, others: list[Keyframe], camera: Camera) -> 
     ahead = z > NEAREST
     u, v = to_pixels(camera, x, y, 1.0 / np.where(ahead, z, 1.0))
     seen = np.mean(ahead & in_image(camera, u, v), axis=1)
-    return [old[k] for k in np.argsort(-seen, kind="stable")[:LOOKED_AT] if seen[k] >= NEARLY * MIN_OVERLAP]
+    return [old[k] for k in np.argsort(-seen, kind="stable")[:MAX_COMPARED] if seen[k] >= NEARLY * MIN_OVERLAP]
 
 
 def _was_tried(new: Keyframe, other: Keyframe) -> bool:

@@ -16,10 +16,10 @@ from gavo_jax.mapping.keyframes import MAX_IMAGES, Keyframe, Keyframes
 from gavo_jax.mapping.pose_graph import REWEIGHTED, Solution, optimise, require_gtsam
 from gavo_jax.mapping.relocalisation import Place, Recogniser
 from gavo_jax.mapping.verification import Edge, Verifier
-from gavo_jax.odometry.drawn import AsTracked
 from gavo_jax.odometry.driver import Found, Moving, Step, seen_moving
+from gavo_jax.odometry.overlays import AsTracked
 from gavo_jax.rigid_motions import log, transport_covariance
-from gavo_jax.status import GRAVITY, AlignmentStatus
+from gavo_jax.status import BY_GRAVITY, AlignmentStatus
 from gavo_jax.trajectory import inverse, stamp_name
 
 STEP_FLOOR = 5e-4
@@ -38,7 +38,7 @@ MOST_IN_THE_END = 100
 """Number of candidates, the most similar ones, that are aligned when loops are searched for again at the end."""
 REMEMBERED = 64
 """Number of frames since a keyframe whose covariance is kept, for later frames that refer to them."""
-SPEAKS_AGAINST = frozenset(GRAVITY)
+SPEAKS_AGAINST = frozenset(BY_GRAVITY)
 """Findings on a motion that speak against it although it is not lost."""
 
 
@@ -50,8 +50,8 @@ class Loops(NamedTuple):
     solution: Solution
 
 
-class _Way(NamedTuple):
-    """The odometry's motion since the last keyframe."""
+class _Uncertainty(NamedTuple):
+    """How uncertain the odometry's motion since the last keyframe is."""
 
     covariance: Float64[np.ndarray, "6 6"]
     """Covariance of δ in a_T_b · exp(δ), metres and radians."""
@@ -77,7 +77,7 @@ class Mapper:
         self.recogniser = Recogniser(self.keyframes.camera, self.verifier)
         self.edges: list[Edge] = []
         self._place: Place | None = None
-        self._known: OrderedDict[str, _Way] = OrderedDict()
+        self._known: OrderedDict[str, _Uncertainty] = OrderedDict()
         self._first: Frame | None = None
         self._newest: tuple[Frame, Step, Float64[np.ndarray, " 6"]] | None = None
         self._next, self._scale = FIRST, 1.0
@@ -204,11 +204,13 @@ class Mapper:
                     self._link(keyframe, place.edge)
                     break
 
-    def _made(self, frame: Frame, step: Step, twist: Float64[np.ndarray, " 6"], way: "_Way | None") -> Keyframe:
+    def _made(
+        self, frame: Frame, step: Step, twist: Float64[np.ndarray, " 6"], uncertainty: "_Uncertainty | None"
+    ) -> Keyframe:
         """A step's frame as a keyframe, with the covariance of the way to it from the last one."""
-        covariance = None if way is None else way.covariance
+        covariance = None if uncertainty is None else uncertainty.covariance
         keyframe = self.keyframes.make(frame, step.index, step.segment, step.world_T_camera, twist, covariance)
-        keyframe.in_doubt = way is not None and way.in_doubt
+        keyframe.in_doubt = uncertainty is not None and uncertainty.in_doubt
         return keyframe
 
     def _doubt(self, steps: Iterable[Step]) -> None:
@@ -229,7 +231,7 @@ class Mapper:
         if before is not None and np.isfinite(covariance).all():
             motion = np.asarray(step.alignment.target_T_reference, np.float64)
             covariance = transport_covariance(motion, before.covariance + covariance)
-            self._known[stamp_name(step.timestamp)] = _Way(covariance, before.in_doubt or is_in_doubt(step))
+            self._known[stamp_name(step.timestamp)] = _Uncertainty(covariance, before.in_doubt or is_in_doubt(step))
             if len(self._known) > REMEMBERED:
                 self._known.popitem(last=False)
 
@@ -237,12 +239,12 @@ class Mapper:
         """Keep the covariance from a new keyframe to its reference, from which later frames may continue."""
         covariance = _covariance(step)
         if np.isfinite(covariance).all():
-            self._known[stamp_name(step.reference_timestamp)] = _Way(covariance, is_in_doubt(step))
+            self._known[stamp_name(step.reference_timestamp)] = _Uncertainty(covariance, is_in_doubt(step))
 
     def _add(self, keyframe: Keyframe) -> None:
         self.keyframes.add(keyframe)
         self._known.clear()
-        self._known[stamp_name(keyframe.timestamp)] = _Way(np.zeros((6, 6)), False)
+        self._known[stamp_name(keyframe.timestamp)] = _Uncertainty(np.zeros((6, 6)), False)
         self._close(self._candidates(keyframe))
         if len(self.keyframes.all) >= self._next:
             self._next = int(GROWTH * len(self.keyframes.all)) + 1

@@ -17,7 +17,7 @@ from gavo_jax.mapping.candidates import LoopCandidate
 from gavo_jax.mapping.keyframes import Keyframe, Thumbnail
 from gavo_jax.mapping.verification import Edge, Verifier
 
-LOOKED_AT = 8
+MATCHED_KEYFRAMES = 8
 """Number of keyframes whose features are matched: those that look most like the frame."""
 ALIGNED = 4
 """Number of matched keyframes that are aligned: those with most matches."""
@@ -55,7 +55,7 @@ class Recogniser:
             frame: The frame, made a keyframe; its poses are not used.
             keyframes: The keyframes to search, with their images.
         """
-        alike = sorted(keyframes, key=lambda other: -likeness(frame.thumbnail, other.thumbnail))[:LOOKED_AT]
+        alike = sorted(keyframes, key=lambda other: -likeness(frame.thumbnail, other.thumbnail))[:MATCHED_KEYFRAMES]
         seen = self._detect(frame)
         guesses: list[tuple[int, LoopCandidate]] = []
         for other in alike:

@@ -20,22 +20,16 @@ from gavo_jax.alignment.stacking import Images
 from gavo_jax.camera import Camera
 from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.image.motion_compensation import CompensatedImages
-from gavo_jax.mapping.candidates import MOST, LoopCandidate
+from gavo_jax.mapping.candidates import MAX_CANDIDATES, LoopCandidate
+from gavo_jax.presets import HALF_SIZE_OBJECTIVE
 from gavo_jax.rigid_motions import interpolate, length_and_angle, transport_covariance
-from gavo_jax.settings import AlignmentOptions, Settings
+from gavo_jax.settings import Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
-SETTINGS = Settings(
-    GaussNewton(iterations=(12, 12, 15, 20, 0), patience=2),
-    AlignmentOptions(
-        points=(4800, 1200, 1200, 1200, 1200), depth_weight=(0.05, 0.05, 0.3, 0.3, 0.3), views=(1, 1, 1, 1, 1)
-    ),
-)
-"""Gauss-Newton from the guess, both ways. The images have half the frame's size, so a level here is the next coarser
-level of the frame.
-"""
+SETTINGS = Settings(GaussNewton(iterations=(12, 12, 15, 20, 0), patience=2), HALF_SIZE_OBJECTIVE)
+"""Gauss-Newton from the guess, both ways."""
 MIN_OVERLAP = 0.5
 """Smallest overlap of the alignment, in both directions."""
 MAX_DISAGREEMENT = (0.02, 0.02)
@@ -79,9 +73,9 @@ class Verifier:
 
     def warm_up(self) -> None:
         """Compile the program, or load it."""
-        size = (MOST, self.camera.height, self.camera.width)
+        size = (MAX_CANDIDATES, self.camera.height, self.camera.width)
         nothing = Images(np.zeros(size, np.uint8), np.zeros(size, np.uint16))
-        self._align(nothing, nothing, np.tile(np.eye(4), (MOST, 1, 1)), 0)
+        self._align(nothing, nothing, np.tile(np.eye(4), (MAX_CANDIDATES, 1, 1)), 0)
 
     def verify(self, candidates: list[LoopCandidate]) -> list[Edge | None]:
         """Verify candidates: return an edge for each one that stands, None for the others.
@@ -89,7 +83,7 @@ class Verifier:
         At the end of a run there are candidates of many keyframes, and nothing else is computed: batches of them are
         aligned in parallel.
         """
-        lots = [candidates[start : start + MOST] for start in range(0, len(candidates), MOST)]
+        lots = [candidates[start : start + MAX_CANDIDATES] for start in range(0, len(candidates), MAX_CANDIDATES)]
         if len(lots) < 2:
             return self._verify(candidates)
         with ThreadPoolExecutor(min(SIDE_BY_SIDE, len(lots))) as workers:
@@ -127,7 +121,7 @@ class Verifier:
     ) -> list[Alignment]:
         if not guesses:
             return []
-        padding = [(0, MOST - len(guesses)), (0, 0), (0, 0)]
+        padding = [(0, MAX_CANDIDATES - len(guesses)), (0, 0), (0, 0)]
 
         def stacked(side: list[CompensatedImages | None]) -> Images:
             known = [images for images in side if images is not None]

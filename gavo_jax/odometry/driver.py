@@ -18,13 +18,7 @@ from gavo_jax.bodies.records import Body, covered, in_world
 from gavo_jax.camera import Camera, require_camera
 from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.compilation.waits import Stopwatch
-from gavo_jax.datasets.base import (
-    Frame,
-    FrameError,
-    as_seconds,
-    require_begin_in_seconds,
-    require_grey_levels,
-)
+from gavo_jax.datasets.base import Frame, FrameError, as_seconds, require_begin_in_seconds, require_grey_levels
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoWarning
 from gavo_jax.frame_checks import Finding, Use, check_frame, doubts_last_stamp
@@ -221,12 +215,12 @@ class Odometry:
         timestamp = as_seconds("timestamp", timestamp)
         frame = self._accepted(frame, timestamp)
         stopwatch = Stopwatch()
-        drawn, self.frame = self.progress.drawn, None
+        overlays, self.frame = self.progress.overlays, None
         if isinstance(frame, Frame):
-            drawn = drawn.after(frame.grey)
-            self.frame = frame = drawn.without(frame)
+            overlays = overlays.after(frame.grey)
+            self.frame = frame = overlays.without(frame)
         finding, history = check_frame(frame, timestamp, self.camera, self.progress.history)
-        before = self.progress._replace(last_index=self.progress.last_index + 1, history=history, drawn=drawn)
+        before = self.progress._replace(last_index=self.progress.last_index + 1, history=history, overlays=overlays)
         usable = self.frame if finding.use is not Use.NOTHING else None
         if usable is not None and finding.use is Use.GREY:
             usable = without_depth(usable)

@@ -10,9 +10,9 @@ from gavo_jax.frame_checks import History
 from gavo_jax.odometry.aligners import expecting
 from gavo_jax.odometry.beginnings import Beginning
 from gavo_jax.odometry.depth_watch import DepthWatch
-from gavo_jax.odometry.drawn import Drawn
 from gavo_jax.odometry.leaps import Leap
 from gavo_jax.odometry.misplaced import Arrival
+from gavo_jax.odometry.overlays import Overlays
 from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.odometry.way import Way
@@ -52,7 +52,7 @@ class Progress(NamedTuple):
     """How the track began, as long as it may have followed a body."""
     depth: DepthWatch | None = None
     """What is known of the reference's depth, and how depth has changed; None before the first reference."""
-    drawn: Drawn = Drawn()
+    overlays: Overlays = Overlays()
     """Overlays drawn into every image."""
 
     def tracker_at(self, timestamp: float) -> Any:

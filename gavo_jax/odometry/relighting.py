@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Integer
 
 from gavo_jax.alignment.visits import levels_of
-from gavo_jax.bodies.evidence import compare, seen_level, view_of
+from gavo_jax.bodies.pixel_evidence import compare, seen_level, view_of
 from gavo_jax.camera import Camera, to_pixels
 from gavo_jax.compilation.programs import CachedProgram
 from gavo_jax.datasets.base import Frame

@@ -20,9 +20,9 @@ from gavo_jax.frame_checks import History
 from gavo_jax.odometry.beginnings import Beginning
 from gavo_jax.odometry.depth_change import DepthChange
 from gavo_jax.odometry.depth_watch import DepthWatch
-from gavo_jax.odometry.drawn import Drawn
 from gavo_jax.odometry.leaps import Leap
 from gavo_jax.odometry.misplaced import Arrival
+from gavo_jax.odometry.overlays import Overlays
 from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.way import Fix, Way
 
@@ -88,8 +88,8 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     arrays |= {_leaf(i): np.asarray(leaf) for i, leaf in enumerate(leaves)}
     if watch is not None:
         arrays |= {INVERSE_DEPTH: watch.change.inverse, EDGES: watch.edges.sums}
-    if progress.drawn.last is not None:
-        arrays |= {LAST_GREY: progress.drawn.last, SAME_LEVEL: progress.drawn.counts}
+    if progress.overlays.last is not None:
+        arrays |= {LAST_GREY: progress.overlays.last, SAME_LEVEL: progress.overlays.counts}
     data = io.BytesIO()
     arrays[SEAL] = np.array(_seal(arrays))
     np.savez(data, **arrays)  # pyright: ignore[reportArgumentType] (NumPy 2.0 takes allow_pickle=False for an array)
@@ -153,9 +153,9 @@ def _progress_of(numbers: dict[str, Any], arrays: dict[str, np.ndarray]) -> Prog
         (delay, *known), seen, told = depth
         change = DepthChange(arrays[INVERSE_DEPTH], delay, *map(tuple, known))
         numbers["depth"] = DepthWatch(change, DepthEdges(arrays[EDGES], *seen), told)
-    drawn = Drawn(arrays[LAST_GREY], arrays[SAME_LEVEL]) if LAST_GREY in arrays else Drawn()
+    overlays = Overlays(arrays[LAST_GREY], arrays[SAME_LEVEL]) if LAST_GREY in arrays else Overlays()
     poses: dict[str, Any] = {name: arrays[name] for name in POSES}
-    return Progress(**numbers, **poses, drawn=drawn)
+    return Progress(**numbers, **poses, overlays=overlays)
 
 
 def _seal(arrays: dict[str, np.ndarray]) -> str:

@@ -277,14 +277,14 @@ class RunFolder:
 
     def steps(self) -> list[Step]:
         """Read the steps of the run so far from its files; see `read_steps`. With loops they have all digits."""
-        steps = self._said()
+        steps = self._recorded_steps()
         return with_motions(steps, self.path / MOTIONS) if MOTIONS in self._files else steps
 
     def moving(self, step: Step) -> Bool[np.ndarray, "height width"] | None:
         """Read the pixels of a step's frame that move on their own; None if the run saw nothing move."""
         return read_masks(self.path, step.timestamp)
 
-    def _said(self) -> list[Step]:
+    def _recorded_steps(self) -> list[Step]:
         """Read the steps from frames.csv and the poses, without an incomplete one left by an interruption."""
         self._cut()
         return read_steps(self.path, Trajectory.read_tum(self.path / self._poses))
@@ -304,7 +304,7 @@ class RunFolder:
 
     def _revise(self) -> None:
         """Rewrite frames.csv if later pairs revise earlier ones; it does not grow after that."""
-        steps = self._said()
+        steps = self._recorded_steps()
         rows = read_text(self.path / FRAMES).splitlines()
         known = with_hindsight(rows, steps)
         if known != rows:

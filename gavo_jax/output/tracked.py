@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from gavo_jax.compilation.waits import Stopwatch, told_of_waits
 from gavo_jax.datasets.base import Frame, Sequence
-from gavo_jax.errors import tell
+from gavo_jax.errors import print_message
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.odometry.driver import Odometry, Step
@@ -71,5 +71,5 @@ def track_visibly(
             interrupted = True
         seconds, compile_seconds = stopwatch.seconds, compile_seconds + stopwatch.waited
     if interrupted:
-        tell(f"{label}: interrupted after {done + len(steps)} of {pairs} pairs")
+        print_message(f"{label}: interrupted after {done + len(steps)} of {pairs} pairs")
     return Tracked(steps, interrupted, seconds, compile_seconds)

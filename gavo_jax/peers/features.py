@@ -11,8 +11,8 @@ from gavo_jax.peers.base import PeerResult, check_size, failure, result_of
 class FeaturePeer:
     """Keypoints, ratio test, `cv2.solvePnPRansac` and `cv2.solvePnPRefineLM`, with the settings of `features`.
 
-    `success` is false if a motion has fewer than `features.FEWEST` inliers. Repeated structure or a few chance matches
-    can agree on a wrong motion.
+    `success` is false if a motion has fewer than `features.MIN_INLIERS` inliers. Repeated structure or a few chance
+    matches can agree on a wrong motion.
     """
 
     def __init__(self, name: str, camera: Camera, kind: FeatureKind) -> None:

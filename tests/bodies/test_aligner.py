@@ -14,8 +14,8 @@ from carded import CAMERA, FRAMES, TRACKED, Carded, beliefs, view
 from gavo_jax.alignment.result import Alignment, no_alignment
 from gavo_jax.bodies.aligner import SUSPECTED, BodyAware, MotionCandidate, _judged
 from gavo_jax.bodies.belief import Belief
-from gavo_jax.bodies.evidence import gather_evidence
 from gavo_jax.bodies.identity import BodyTracks, associate, body_components
+from gavo_jax.bodies.pixel_evidence import gather_evidence
 from gavo_jax.bodies.records import Seen, in_world
 from gavo_jax.bodies.scene import MotionSegmenter
 from gavo_jax.compilation import programs

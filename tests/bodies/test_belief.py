@@ -6,7 +6,7 @@ import pytest
 from carded import BOX, OTHER, Carded, beliefs, field
 
 from gavo_jax.bodies.belief import follow, suspect
-from gavo_jax.bodies.evidence import PixelEvidence
+from gavo_jax.bodies.pixel_evidence import PixelEvidence
 
 
 def test_a_suspicion_spreads_to_what_comes_into_view_of_its_surface_and_no_further() -> None:

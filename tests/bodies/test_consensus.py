@@ -13,7 +13,7 @@ from small import NEWTON
 
 from gavo_jax.alignment.visits import prepare_target
 from gavo_jax.bodies.consensus import Blocks, _whitened, ask_area, gain_of_its_own, weighted_median
-from gavo_jax.bodies.evidence import View, view_of
+from gavo_jax.bodies.pixel_evidence import View, view_of
 from gavo_jax.bodies.scene import MotionSegmenter
 from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequence

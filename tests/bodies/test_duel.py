@@ -30,7 +30,7 @@ def duel(apart: float, deviation: float = 1e-3, age: Span = UNDECIDED, **changes
 
 
 def verdicts(one: Duel) -> set[str]:
-    said = {"won": one.is_won, "doubt": one.casts_doubt, "lost": one.is_lost, "given up": one.is_given_up}
+    said = {"won": one.is_won, "doubt": one.casts_doubt, "lost": one.is_rival_unsupported, "given up": one.is_given_up}
     return {name for name, is_so in said.items() if is_so}
 
 

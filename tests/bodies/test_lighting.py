@@ -12,8 +12,8 @@ from carded import TRACKED
 from flicker import followed
 
 from gavo_jax.alignment.visits import prepare_target
-from gavo_jax.bodies.evidence import Compared, compare, view_of
 from gavo_jax.bodies.lighting import light_change
+from gavo_jax.bodies.pixel_evidence import Compared, compare, view_of
 from gavo_jax.bodies.scene import MotionSegmenter
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.layouts.tum import TumSequence

@@ -15,7 +15,7 @@ from gavo_jax.calibration.file import write_camera_file
 from gavo_jax.calibration.pairs import Kinematics, Matched, Unknowns, evened
 from gavo_jax.calibration.scan import coarse, refine
 from gavo_jax.camera_files.calibration import Calibration, load_calibration
-from gavo_jax.cli.calibrate import calibration_of, in_all
+from gavo_jax.cli.calibrate import calibration_of, with_total_delay
 from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.depth_unit import KINECT_STEP
@@ -244,6 +244,6 @@ def test_what_is_not_determined_stays_as_it_was():
 def test_a_delay_is_told_as_it_stands_in_the_file():
     """Of a camera whose delay was known already, the table said what was left of it."""
     found = {"depth_delay": Found(-0.0003, 0.0024, "s", "depth residuals"), "readout": Found(None, None, "s", "no")}
-    told = in_all(found, -0.0237)["depth_delay"]
+    told = with_total_delay(found, -0.0237)["depth_delay"]
     assert told.value == -0.0237 and told.deviation == 0.0024 and "-0.0003 s of it was found now" in told.why
-    assert in_all(found, -0.0003) == found and in_all({}, 0.1) == {}
+    assert with_total_delay(found, -0.0003) == found and with_total_delay({}, 0.1) == {}

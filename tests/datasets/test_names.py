@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gavo_jax.datasets.names import Found, by_number, form, images_among
+from gavo_jax.datasets.names import Found, by_number, images_among, mask_numbers
 from gavo_jax.datasets.names import stamps as read
 from gavo_jax.errors import GavoError
 
@@ -171,8 +171,9 @@ def test_even_numbers_count_what_the_other_kind_counts():
 
 
 def test_the_form_of_a_name_is_what_its_numbers_leave():
-    assert form("a_5") == form("a_17") != form("b_5")
-    assert form("1305031102175") != form("17") and form("a_1305031102175") == form("a_1305031102209")
+    assert mask_numbers("a_5") == mask_numbers("a_17") != mask_numbers("b_5")
+    assert mask_numbers("1305031102175") != mask_numbers("17")
+    assert mask_numbers("a_1305031102175") == mask_numbers("a_1305031102209")
 
 
 def test_a_stray_file_changes_no_unit():

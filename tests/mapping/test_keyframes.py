@@ -14,7 +14,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.rendered.sensor_noise import NONE
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.image.motion_compensation import compensate_motion
-from gavo_jax.mapping.candidates import APART, MIN_SECONDS, MOST, LoopCandidate, find_candidates
+from gavo_jax.mapping.candidates import APART, MAX_CANDIDATES, MIN_SECONDS, LoopCandidate, find_candidates
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.keyframes import NOTHING_SEEN, Keyframe, Keyframes, shift, shifts
 from gavo_jax.mapping.mapper import Mapper, tied_segments
@@ -494,8 +494,8 @@ def test_many_candidates_are_verified_side_by_side_to_the_same_edges():
     many = [LoopCandidate(frames[0], later, guess, 1.0, 1.0) for later, guess in zip(frames[1:], guesses, strict=True)]
     alone = [edge for candidate in many for edge in mapper.verifier.verify([candidate])]
     together = mapper.verifier.verify(many)
-    assert len(many) > MOST and [edge is None for edge in together] == [edge is None for edge in alone]
-    assert sum(edge is not None for edge in together) > MOST
+    assert len(many) > MAX_CANDIDATES and [edge is None for edge in together] == [edge is None for edge in alone]
+    assert sum(edge is not None for edge in together) > MAX_CANDIDATES
     for one, other in zip(together, alone, strict=True):
         if one is not None and other is not None:
             assert (one.earlier, one.later) == (other.earlier, other.later)

@@ -21,9 +21,9 @@ from gavo_jax.cli import main, run
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.composition import blank_of
-from gavo_jax.odometry.drawn import Drawn
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.leaps import Leap
+from gavo_jax.odometry.overlays import Overlays
 from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.odometry.stream import track
@@ -452,6 +452,6 @@ def test_killed_at_twenty_random_moments(clip, tmp_path, method):
 
 def test_a_checkpoint_of_large_images_can_be_read(tmp_path: Path) -> None:
     """From 1920x1080 on each was larger than was allowed."""
-    drawn = Drawn().after(np.zeros((1080, 1920), np.float32))
-    save_checkpoint(tmp_path / "checkpoint.npz", Checkpoint(Progress()._replace(drawn=drawn), {}))
-    assert load_checkpoint(tmp_path / "checkpoint.npz", ()).progress.drawn.last is not None
+    overlays = Overlays().after(np.zeros((1080, 1920), np.float32))
+    save_checkpoint(tmp_path / "checkpoint.npz", Checkpoint(Progress()._replace(overlays=overlays), {}))
+    assert load_checkpoint(tmp_path / "checkpoint.npz", ()).progress.overlays.last is not None

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from gavo_jax.datasets.films import FILMS, frames_of
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
-from gavo_jax.datasets.names import form, images_among
+from gavo_jax.datasets.names import images_among, mask_numbers
 
 COLOR_FOLDERS = (
     *("color", "colour", "rgb", "image", "images", "image_left", "lowres_wide"),
@@ -176,8 +176,8 @@ def plain_files(path: Path) -> tuple[list[Path], list[Path]]:
 def _partners(files: list[Path], depths: list[Path]) -> list[Path]:
     """Files named as depth is but for its word, `desk_1.png` beside `desk_1_depth.png`, and others of their form."""
     stems = {DEPTH_PART.sub(kept, file.stem) for file in depths for kept in ("", r"\1", r"\2")}
-    forms = {form(file.stem) for file in files if file.stem in stems}
-    return [file for file in files if form(file.stem) in forms]
+    forms = {mask_numbers(file.stem) for file in files if file.stem in stems}
+    return [file for file in files if mask_numbers(file.stem) in forms]
 
 
 def _with_depth(files: list[Path]) -> list[Path]:

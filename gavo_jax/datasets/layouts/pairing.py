@@ -8,7 +8,7 @@ import numpy as np
 
 from gavo_jax.datasets.clocks import MOST_STEPS, NAMES, clock_unit
 from gavo_jax.datasets.files import Entry, Reading
-from gavo_jax.datasets.names import by_number, form, nameless, stamps, unpaired
+from gavo_jax.datasets.names import by_number, mask_numbers, nameless, stamps, unpaired
 from gavo_jax.datasets.truth import Seconds
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import associate
@@ -116,7 +116,7 @@ def _timed(files: list[Path], unit: float | None = None) -> _Timed | None:
         return _Timed(files, *found)
     forms: dict[str, list[Path]] = {}
     for file in files:
-        forms.setdefault(form(file.stem), []).append(file)
+        forms.setdefault(mask_numbers(file.stem), []).append(file)
     usual = max(forms.values(), key=len, default=[])
     if len(usual) in (len(files), *range(FEWEST_FOR_A_RATE)):
         return None

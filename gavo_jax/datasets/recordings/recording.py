@@ -29,7 +29,7 @@ from gavo_jax.datasets.recordings.messages import (
     is_depth,
 )
 from gavo_jax.datasets.recordings.stamps import Topic
-from gavo_jax.datasets.recordings.topics import Images, are_of_two_cameras, choose, says_rectified, says_registered
+from gavo_jax.datasets.recordings.topics import ImageTopic, are_of_two_cameras, choose, says_rectified, says_registered
 from gavo_jax.datasets.recordings.transforms import ANY_TOPIC, FIXED_TOPIC, TRANSFORMS, between, fixed_transforms
 from gavo_jax.errors import GavoError, blamed
 
@@ -119,7 +119,7 @@ class Bag:
         images = {}
         for name, kind in sorted(self.kinds.items()):
             if (message := self.first(name)) is not None:
-                images[name] = Images.of(kind, message, name)
+                images[name] = ImageTopic.of(kind, message, name)
         color, depth = choose(self.path, images, reading.color_topic, reading.depth_topic)
         are_named = reading.color_topic is not None and reading.depth_topic is not None
         if are_of_two_cameras(color, depth) and not are_named:

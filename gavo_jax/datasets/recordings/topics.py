@@ -32,7 +32,7 @@ RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
 """Matches names of topics whose images are rectified."""
 
 
-class Images(NamedTuple):
+class ImageTopic(NamedTuple):
     """Properties of an image topic, from its first message."""
 
     is_depth: bool
@@ -42,12 +42,12 @@ class Images(NamedTuple):
     """Coordinate frame of the camera."""
 
     @classmethod
-    def of(cls, kind: str, message: Any, topic: str) -> "Images":
+    def of(cls, kind: str, message: Any, topic: str) -> "ImageTopic":
         """Describe a topic by a message of type `kind`."""
         return cls(is_depth(kind, message, topic), encoding_of(kind, message), message.header.frame_id)
 
 
-def choose(path: Path, images: Mapping[str, Images], color: str | None, depth: str | None) -> tuple[str, str]:
+def choose(path: Path, images: Mapping[str, ImageTopic], color: str | None, depth: str | None) -> tuple[str, str]:
     """Return the colour and depth topics: those given, else those of the same camera.
 
     Args:
@@ -101,7 +101,7 @@ def says_rectified(topic: str) -> bool:
     return bool(RECTIFIED.search(topic))
 
 
-def _of_depth(images: Mapping[str, Images], color: str | None, depth: str | None) -> list[str]:
+def _of_depth(images: Mapping[str, ImageTopic], color: str | None, depth: str | None) -> list[str]:
     """Candidates for the depth topic."""
     if depth is not None:
         return [depth]
@@ -109,7 +109,7 @@ def _of_depth(images: Mapping[str, Images], color: str | None, depth: str | None
     return [name for name in names if name != color] or names
 
 
-def _of_color(images: Mapping[str, Images], color: str | None, depth: str | None) -> list[str]:
+def _of_color(images: Mapping[str, ImageTopic], color: str | None, depth: str | None) -> list[str]:
     """Candidates for the colour topic; visualised depth counts only if there is nothing else."""
     if color is not None:
         return [color]
@@ -156,7 +156,7 @@ def _shows_depth(topic: str) -> bool:
     return "depth" in DEVICE.sub("", name) or "depth" in name and bool(COLORED.search(name))
 
 
-def _unread(images: Mapping[str, Images]) -> str:
+def _unread(images: Mapping[str, ImageTopic]) -> str:
     """Describe topics that are named as depth, but have another encoding; empty if there are none."""
     faults = [f"{name} has {one.encoding[:40]!r}" for name, one in sorted(images.items()) if _shows_depth(name)]
     return f": {', '.join(faults)}, and not {', '.join(DEPTH_ENCODINGS)}" if faults else ""

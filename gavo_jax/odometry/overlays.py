@@ -23,7 +23,7 @@ CHANGED, MOVED = 2, 0.5
 """Change in grey levels, and the share of pixels with something to see that has to exceed it: then the camera moves."""
 FRAMES = 8
 """Consecutive images of a moving camera in which an overlay keeps its exact level."""
-LEAST = 5e-3
+MIN_OVERLAY_SHARE = 5e-3
 """Share of the pixels that has to be overlay and steep. Clean clips of the TUM benchmark have 0.002 at most."""
 REACH = 5
 """Sampled pixels around an overlay that coding and the search's interpolation mix with it."""
@@ -33,7 +33,7 @@ LITTLE = 0.01
 """Weight of the whole image's mean, as a share of the surroundings, for where everything around is overlay."""
 
 
-class Drawn(NamedTuple):
+class Overlays(NamedTuple):
     """What is known of overlays, on every `STEP`th pixel."""
 
     last: Num[np.ndarray, "h w"] | None = None
@@ -44,7 +44,7 @@ class Drawn(NamedTuple):
     @property
     def is_any(self) -> bool:
         """Whether enough of the image keeps its level for an overlay to be there."""
-        return self.counts.size > 0 and bool(np.mean(self.counts >= FRAMES) >= LEAST)
+        return self.counts.size > 0 and bool(np.mean(self.counts >= FRAMES) >= MIN_OVERLAY_SHARE)
 
     def after(self, grey: np.ndarray) -> Self:
         """Update with one more image."""
@@ -65,7 +65,7 @@ class Drawn(NamedTuple):
         if self.last is None or not self.is_any:
             return frame
         edges = (self.counts >= FRAMES) & _is_steep(self.last)
-        if np.count_nonzero(edges) < LEAST * edges.size:
+        if np.count_nonzero(edges) < MIN_OVERLAY_SHARE * edges.size:
             return frame
         drawn = cv2.dilate(edges.astype(np.uint8), np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)) > 0
         grey, depth = np.asarray(frame.grey), np.asarray(frame.depth)
@@ -87,7 +87,7 @@ class AsTracked:
 
     def __init__(self, sequence: Sequence, is_drawn_on: bool = True) -> None:
         self._sequence, self._is_drawn_on = sequence, is_drawn_on
-        self._drawn, self._next = Drawn(), 0
+        self._overlays, self._next = Overlays(), 0
 
     def __getitem__(self, index: int) -> Frame:
         """A frame after those that were asked for before, without distortion and overlays.
@@ -97,13 +97,13 @@ class AsTracked:
         """
         for number in range(self._next, index) if self._is_drawn_on else ():
             with contextlib.suppress(FrameError):
-                self._drawn = self._drawn.after(rectified_at(self._sequence, number).grey)
+                self._overlays = self._overlays.after(rectified_at(self._sequence, number).grey)
         self._next = index + 1
         frame = rectified_at(self._sequence, index)
         if not self._is_drawn_on:
             return frame
-        self._drawn = self._drawn.after(frame.grey)
-        return self._drawn.without(frame)
+        self._overlays = self._overlays.after(frame.grey)
+        return self._overlays.without(frame)
 
 
 def _is_steep(image: np.ndarray) -> np.ndarray:

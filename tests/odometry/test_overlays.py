@@ -13,8 +13,8 @@ from small import Rendered
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.rendered.sensor_noise import KINECT, NONE, SensorNoise
 from gavo_jax.mapping.mapper import Mapper
-from gavo_jax.odometry.drawn import FRAMES, AsTracked, Drawn
 from gavo_jax.odometry.driver import Odometry, Step
+from gavo_jax.odometry.overlays import FRAMES, AsTracked, Overlays
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.odometry.stream import track
 from gavo_jax.output.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
@@ -30,11 +30,11 @@ def marked(_: int, frame: Frame) -> Frame:
     return replace(frame, grey=grey)
 
 
-def seen(frames: Iterable[Frame]) -> Drawn:
-    drawn = Drawn()
+def seen(frames: Iterable[Frame]) -> Overlays:
+    overlays = Overlays()
     for frame in frames:
-        drawn = drawn.after(frame.grey)
-    return drawn
+        overlays = overlays.after(frame.grey)
+    return overlays
 
 
 def test_what_is_drawn_loses_its_edges_and_its_depth_and_nothing_else_does() -> None:
@@ -53,10 +53,10 @@ def test_what_is_drawn_loses_its_edges_and_its_depth_and_nothing_else_does() -> 
 @pytest.mark.parametrize("noise", [KINECT, NONE])
 @pytest.mark.parametrize("speed", [0.2, 1.0])
 def test_a_scene_is_not_taken_for_a_drawing(noise: SensorNoise, speed: float) -> None:
-    drawn = Drawn()
+    overlays = Overlays()
     for frame in Rendered(30, camera=small.CAMERA, noise=noise, speed=speed):
-        drawn = drawn.after(frame.grey)
-        assert drawn.without(frame) is frame
+        overlays = overlays.after(frame.grey)
+        assert overlays.without(frame) is frame
 
 
 def test_a_camera_that_stands_still_draws_nothing() -> None:
@@ -66,9 +66,9 @@ def test_a_camera_that_stands_still_draws_nothing() -> None:
 
 
 def test_another_size_begins_anew() -> None:
-    drawn = seen(marked(i, frame) for i, frame in enumerate(ROOM))
+    overlays = seen(marked(i, frame) for i, frame in enumerate(ROOM))
     small_image = Rendered(1, camera=small.CAMERA.level(1))[0]
-    assert drawn.after(small_image.grey).without(small_image) is small_image
+    assert overlays.after(small_image.grey).without(small_image) is small_image
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64, np.int32])
@@ -81,10 +81,10 @@ def test_levels_of_any_kind(kind: type) -> None:
 @pytest.mark.filterwarnings("error")
 def test_an_image_without_levels_is_looked_at_without_a_word() -> None:
     images = [np.full((40, 60), value) for value in (np.inf, -np.inf, np.nan, 3e38, -1.0, 7)]
-    drawn = Drawn()
+    overlays = Overlays()
     for image in (*images, *images[::-1], *(image.astype(np.uint8) for image in images[-1:])):
-        drawn = drawn.after(image)
-    assert not np.any(drawn.counts)
+        overlays = overlays.after(image)
+    assert not np.any(overlays.counts)
 
 
 def test_a_run_is_not_held_by_what_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,7 +99,7 @@ def test_a_run_is_not_held_by_what_is_drawn(monkeypatch: pytest.MonkeyPatch) -> 
 
     true = truth.interpolate(ROOM.timestamps)[0]
     freed = error()
-    monkeypatch.setattr(Drawn, "without", lambda self, frame: frame)
+    monkeypatch.setattr(Overlays, "without", lambda self, frame: frame)
     assert freed < 0.3 * error()
 
 
@@ -112,7 +112,7 @@ def test_a_run_that_goes_on_knows_what_is_drawn(tmp_path) -> None:
     save_checkpoint(tmp_path / "checkpoint.npz", Checkpoint(first.progress, {}, ""))
     again = Odometry(small.CAMERA, SEARCH_ALONE)
     again.progress = load_checkpoint(tmp_path / "checkpoint.npz", first.progress.tracker).progress
-    assert again.progress.drawn.counts.dtype == np.uint8
+    assert again.progress.overlays.counts.dtype == np.uint8
     rest = [*track(sequence, odometry=again)]
     np.testing.assert_array_equal(rest[-1].world_T_camera, whole[-1].world_T_camera)
 

@@ -88,7 +88,7 @@ SLACK = 0.4
 """Pixels by which a correct motion may seem off, because of shutter, timestamps and registration of depth."""
 SLACK_OF_FLOW = 0.04
 """Additional slack for each pixel of image motion between neighbouring frames."""
-FEW = 16
+BRIGHTNESS_STRIDE = 16
 """One pixel in this many is used to estimate brightness."""
 
 
@@ -181,11 +181,11 @@ def compare(
         )
 
     r = jax.vmap(against)(others.image, others.sweep, others_T_here)
-    few: Residuals = jax.tree.map(lambda leaf: leaf[:, :: max(1, FEW // stride**2)], r)
+    few: Residuals = jax.tree.map(lambda leaf: leaf[:, :: max(1, BRIGHTNESS_STRIDE // stride**2)], r)
     # pixels of other surfaces would lower the regression's gain, and dark parts of the scene would seem to change
     few = few._replace(inside=few.inside * (jnp.abs(few.depth) < LARGE_DEPTH_RESIDUAL))
     seen_grey = jnp.broadcast_to(grey.value, r.grey.shape)
-    brightness = estimate_brightness(seen_grey[:, :: max(1, FEW // stride**2)], few)
+    brightness = estimate_brightness(seen_grey[:, :: max(1, BRIGHTNESS_STRIDE // stride**2)], few)
     as_bright = brightness.seen(seen_grey)
     residual = r.grey_sample.value - as_bright
     same = lit_in_both(r) * (jnp.abs(r.depth) < LARGE_DEPTH_RESIDUAL)
