@@ -10,7 +10,7 @@ import jax
 
 from gavo_jax.compilation.compiler import processor_digest
 from gavo_jax.compilation.programs import keep_programs_in
-from gavo_jax.errors import GavoWarning
+from gavo_jax.errors import GavoWarning, as_path
 
 OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
@@ -76,13 +76,13 @@ def enable_compilation_cache(folder: str | Path | None = None) -> None:
             `JAX_COMPILATION_CACHE_DIR` is set, JAX keeps its part there, and whoever sets it decides who may write.
     """
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
-    named = folder or os.environ.get("GAVO_CACHE_DIR")
-    folder = cache_folder() if folder is None else Path(folder)
-    if folder is None and named:
-        _warn(f"{named}: there is no such home folder: nothing is kept")
+    is_named = folder is not None or bool(os.environ.get("GAVO_CACHE_DIR"))
+    folder = cache_folder() if folder is None else as_path(folder)
+    if folder is None and is_named:
+        _warn(f"{os.environ['GAVO_CACHE_DIR']}: there is no such home folder: nothing is kept")
     keeps_compiled = not os.environ.get("JAX_COMPILATION_CACHE_DIR")
     parts = ["", "traced", "jax", f"jax/{processor_digest()}"][: 4 if keeps_compiled else 2]
-    if folder is None or not all(_is_private(folder / part, bool(named)) for part in parts):
+    if folder is None or not all(_is_private(folder / part, is_named) for part in parts):
         keep_programs_in(None)
         return
     keep_programs_in(folder / "traced")

@@ -27,7 +27,7 @@ from gavo_jax.datasets.files import (
 )
 from gavo_jax.datasets.names import decimal_unit, filled_in, unit_of, unpaired
 from gavo_jax.datasets.truth import Seconds, truth_in, unread_truth
-from gavo_jax.errors import GavoError, data_rows, number, without_heading
+from gavo_jax.errors import GavoError, as_path, data_rows, number, without_heading
 from gavo_jax.trajectory import Trajectory, associate
 
 MAX_DIFFERENCE = 0.02
@@ -106,7 +106,7 @@ class TumSequence(FileSequence):
             GavoError: missing folder or list, malformed row (file:line), a path that leaves the folder, no pair
                 of stamps near enough, unusable ground truth, or unknown camera.
         """
-        self.folder = Path(folder)
+        self.folder = as_path(folder)
         resolved = resolve_folder(self.folder)
         reading = Reading("auto" if camera is None else camera, depth_scale, rate, color, undistort, max_difference)
         lists = _read_lists(resolved, self.folder, self.LISTS, rate)
