@@ -194,8 +194,8 @@ def duplicated(clip: FrameSequence, places: list[int]) -> Damaged:
     """Repeat every frame half an interval later, with jitter in its grey levels."""
     del places
     sequence = Damaged(clip, [i for i in range(len(clip)) for _ in (0, 1)])
-    middle = clip.timestamps[:-1] + np.diff(clip.timestamps) / 2
-    sequence.timestamps[1:-1:2], sequence.timestamps[-1] = middle, clip.timestamps[-1] + 1 / 60
+    halves = np.diff(clip.timestamps) / 2
+    sequence.timestamps[1::2] += np.append(halves, np.median(halves))
     sequence.moments = sequence.timestamps.copy()
     sequence.damaged = set(range(1, len(sequence), 2))
     sequence.alter = dict.fromkeys(sequence.damaged, jitter)
@@ -206,6 +206,11 @@ def jitter(clip: FrameSequence, index: int, frame: Frame) -> Frame:
     """Change each pixel by at most one grey level, at random."""
     change = np.random.default_rng(index).integers(-1, 2, frame.grey.shape)
     return replace(frame, grey=np.clip(frame.grey + change, 0, 255).astype(frame.grey.dtype))
+
+
+def two_metres(clip: FrameSequence, index: int, frame: Frame) -> Frame:
+    """Set all depth to 2 m."""
+    return replace(frame, depth=np.full_like(frame.depth, round(2 * float(clip.camera.depth_scale))))
 
 
 def half_old(clip: FrameSequence, index: int, frame: Frame) -> Frame:
@@ -295,13 +300,13 @@ FAULTS: dict[str, Fault] = {
     "depth x 1.5": with_depth(lambda depth: depth * 1.5),
     "depth upside down": with_depth(np.flipud),
     "depth permuted": with_depth(permuted),
-    "depth of 2 m": with_depth(lambda depth: np.full_like(depth, 10000)),
+    "depth of 2 m": altered(two_metres),
     "depth shifted": with_depth(lambda depth: np.roll(depth, 40, axis=1)),
     "depth old": altered(late(5)),
     "depth frozen": frozen_depth,
     "depth x 2 for 10": with_depth(lambda depth: np.minimum(depth.astype(int) * 2, 65535), 10),
     "depth upside down for 10": with_depth(np.flipud, 10),
-    "depth of 2 m for 10": with_depth(lambda depth: np.full_like(depth, 10000), 10),
+    "depth of 2 m for 10": altered(two_metres, 10),
 }
 LAWFUL: dict[str, Fault] = {
     "gain x 0.4 for 10": with_grey(lambda grey: (grey * 0.4).astype(grey.dtype), 10),

@@ -110,13 +110,25 @@ def as_whole(name: str, value: Any) -> int:
         raise GavoError(f"{name}: a whole number is needed, not {shown(value)}") from None
 
 
+def as_path(value: Any) -> Path:
+    """Return a path that is given as a text or a path.
+
+    Raises:
+        GavoError: It is neither.
+    """
+    try:
+        return Path(value)
+    except TypeError:
+        raise GavoError(f"the path of a file or folder is needed, not {shown(value)}") from None
+
+
 def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
     """Return the text of a UTF-8 file.
 
     Raises:
         GavoError: the file is missing, not a regular file, unreadable, larger than `max_bytes` or not UTF-8.
     """
-    path = Path(path)
+    path = as_path(path)
     try:
         if path.exists() and not path.is_file():
             raise GavoError(f"{path}: not a file")
@@ -244,7 +256,7 @@ def write_bytes(path: str | Path, data: bytes) -> None:
     Raises:
         GavoError: the file cannot be written.
     """
-    path = Path(path)
+    path = as_path(path)
     partial = partial_of(path)
     try:
         partial.unlink(missing_ok=True)

@@ -20,7 +20,7 @@ from gavo_jax.bodies.records import without_moving
 from gavo_jax.camera import Camera, require_camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence, require_sequence
 from gavo_jax.datasets.rectified import rectified
-from gavo_jax.errors import GavoError, GavoWarning, partial_of
+from gavo_jax.errors import GavoError, GavoWarning, as_path, partial_of
 from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.libusb import import_open3d
 from gavo_jax.map_blocks import BLOCK, MOST_BLOCKS, image_for_blocks
@@ -86,7 +86,7 @@ class SceneMap:
         Raises:
             GavoError: unsuitable ending, empty map, or the file cannot be written.
         """
-        path = Path(path)
+        path = as_path(path)
         check_map(path, self.shape)
         if len(self.points) == 0:
             raise GavoError(f"{path}: not written: nothing nearer than {FARTHEST:g} m was seen often enough for a map")
@@ -385,7 +385,7 @@ def check_map(path: str | Path, shape: Shape | None = None) -> Shape:
     Raises:
         GavoError: unknown ending, or one that cannot hold the shape.
     """
-    ending = Path(path).suffix.lower()
+    ending = as_path(path).suffix.lower()
     if ending not in ENDINGS:
         raise GavoError(f"{path}: a map ends in {', '.join(ENDINGS)}, not in {ending or 'nothing'!r}")
     if shape is None:

@@ -16,7 +16,7 @@ import optax
 import tomli_w
 
 from gavo_jax import presets
-from gavo_jax.errors import GavoError, parse_toml, read_json_object, read_toml, shown, write_bytes
+from gavo_jax.errors import GavoError, as_path, parse_toml, read_json_object, read_toml, shown, write_bytes
 from gavo_jax.objective.losses import LOSSES
 from gavo_jax.settings import Settings
 from gavo_jax.settings_check import MAX_REAL, alternatives, is_whole, kind_of, require_settings
@@ -55,7 +55,7 @@ def load_settings(path: str | Path, method: str = "ga", preset: str = "default")
     Raises:
         GavoError: It cannot be read, or holds an unknown name (with the nearest known one) or a wrong value.
     """
-    path = Path(path)
+    path = as_path(path)
     read = read_json_object if path.suffix == ".json" else read_toml
     table = read(path, MAX_FILE_BYTES)
     if path.suffix == ".json":

@@ -173,6 +173,14 @@ def test_faults_are_counted(load, quick, tmp_path: Path) -> None:
         faults.main(clips=CLIP, faults="nonsense")
 
 
+def test_faults_go_by_the_clips_rate_and_units(load) -> None:
+    """The last stamp was that of a clip of 30 Hz, and depth of 2 m was 10 m where it is in millimetres."""
+    faults: ModuleType = load("faults")
+    slow = Rendered(4, camera=replace(CAMERA, depth_scale=1000.0), rate=5.0)
+    np.testing.assert_allclose(np.diff(faults.duplicated(slow, []).timestamps), 0.1)
+    assert np.all(faults.FAULTS["depth of 2 m"](slow, [1])[1].depth == 2000)
+
+
 def test_conditions_are_compared_with_the_clip_as_it_is(load, tmp_path: Path) -> None:
     conditions: ModuleType = load("conditions")
     conditions.main(

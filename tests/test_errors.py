@@ -4,8 +4,10 @@ import math
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 
+import gavo_jax as gavo
 from gavo_jax.errors import PARTIAL, GavoError, number, partial_of, printable, write_bytes
 from gavo_jax.output.files import remove_files
 
@@ -86,3 +88,25 @@ def test_what_is_no_number_is_not_taken_for_one(text):
 def test_the_message_outlives_a_process_border():
     fault = GavoError("a\x1bb:  twice\nas long")
     assert str(fault) == "a\\x1bb: twice as long" == str(pickle.loads(pickle.dumps(fault)))
+
+
+TAKERS = {
+    "open_source": gavo.open_source,
+    "TumSequence": gavo.TumSequence,
+    "load_settings": gavo.load_settings,
+    "save_settings": lambda path: gavo.save_settings(path, gavo.preset("ga")),
+    "load_calibration": gavo.load_calibration,
+    "load_camera": gavo.load_camera,
+    "read_tum": gavo.Trajectory.read_tum,
+    "write_trajectory": lambda path: gavo.write_trajectory(gavo.Trajectory(np.zeros(1), np.eye(4)[None]), path, "tum"),
+    "write_tum": lambda path: gavo.write_tum(gavo.SyntheticSequence(1), path),
+    "enable_compilation_cache": gavo.enable_compilation_cache,
+}
+
+
+@pytest.mark.parametrize("wrong", [3, b"x", ["a"], np.zeros(2)], ids=str)
+@pytest.mark.parametrize("taker", TAKERS)
+def test_what_is_no_path_is_one_line(taker, wrong):
+    """It was a TypeError of pathlib's."""
+    with pytest.raises(GavoError, match="the path of a file or folder is needed, not "):
+        TAKERS[taker](wrong)

@@ -25,7 +25,7 @@ from gavo_jax.se3 import rigid_inverse
 from gavo_jax.settings import Settings
 
 OLD = 0.22
-"""Age in seconds at which the middle view replaces the older one."""
+"""Seconds for which a view is kept as the middle one before it replaces the older one."""
 FAR_OFF = 0.7
 """The older view is replaced at once if it sees less than this share of the static scene. Over a long way, pose errors
 and other light look like bodies.
@@ -46,7 +46,7 @@ class Scene(NamedTuple):
     views_T_last: Float[Array, "3 4 4"]
     """Motions from the last frame's camera into those of `views`."""
     age: Float[np.ndarray, ""]
-    """Age of the middle view, seconds."""
+    """Seconds since the middle view became that; it is of the frame before."""
     seconds_extrapolated: Float[np.ndarray, ""]
     """Seconds for which the last motion has stood in for one that was not found."""
 
@@ -172,7 +172,7 @@ class MotionSegmenter:
 
 
 def _age_after(scene: Scene, elapsed: float) -> float:
-    """Return the age of the middle view, seconds, at the new frame; 0 where that view becomes the older one."""
+    """Return the scene's `age` at the new frame: 0 where the last frame's view becomes the middle one."""
     age = float(scene.age) + elapsed
     return age if age < OLD else 0.0
 

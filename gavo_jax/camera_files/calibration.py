@@ -11,7 +11,7 @@ from jaxtyping import Float
 from gavo_jax.camera import DISTORTION_COUNTS, MAX_SIDE, MIN_SIDE, PRESETS, Camera
 from gavo_jax.camera_files.makes import PARSERS, PROJECTION, Table
 from gavo_jax.camera_files.words import CAMERA_KEYS, DEVICE_KEYS, MODELS, REQUIRED, model_of
-from gavo_jax.errors import GavoError, read_text, shown
+from gavo_jax.errors import GavoError, as_path, read_text, shown
 from gavo_jax.se3 import is_rigid, rigid
 
 MAX_CAMERA_FILE_BYTES, MAX_JSON_BYTES = 65536, 2**24
@@ -139,7 +139,7 @@ def load_calibration(
     """
     if (name := str(path_or_name)) in PRESETS:
         return Calibration(PRESETS[name], origin=f"preset {name}", preset=name)
-    path = Path(path_or_name)
+    path = as_path(path_or_name)
     suffix = path.suffix.lower()
     if suffix not in PARSERS:
         *suffixes, last = PARSERS

@@ -39,6 +39,8 @@ def tune(options: Tune) -> int:
 def _search(tuning: Tuning, options: Tune, trials: int, folder: Path) -> int:
     storage = options.storage or f"sqlite:///{(folder / STUDY).resolve()}"
     be_ready()
+    for line in tuning.skipped:
+        say(line)
     say(f"study {tuning.name}: {trials} trials of {tuning.method}, {tuning.preset}, in {without_password(storage)}")
 
     def show(trial: int, drift: float, milliseconds: float) -> None:

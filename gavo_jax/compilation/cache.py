@@ -10,7 +10,7 @@ import jax
 
 from gavo_jax.compilation.compiler import processor_digest
 from gavo_jax.compilation.programs import keep_programs_in
-from gavo_jax.errors import GavoWarning
+from gavo_jax.errors import GavoWarning, as_path
 
 OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
@@ -67,18 +67,22 @@ def enable_compilation_cache(folder: str | Path | None = None) -> None:
     folder: JAX would load what another one compiled, and could meet instructions that this one lacks.
 
     A kept program is run as it is found, so the folder must be private. If it belongs to another user, or others can
-    write to it, a `GavoWarning` says so and nothing is kept. An entry that cannot be read or written (truncated by a
-    kill, a full disk) silently costs a compilation.
+    write to it, a `GavoWarning` says so and nothing is kept. The same holds for a folder that is named here or by
+    `GAVO_CACHE_DIR` and cannot be used; the user's own one may be missing. An entry that cannot be read or written
+    (truncated by a kill, a full disk) silently costs a compilation.
 
     Args:
         folder: The folder; by default `GAVO_CACHE_DIR`, else the user's cache folder for this package. If
             `JAX_COMPILATION_CACHE_DIR` is set, JAX keeps its part there, and whoever sets it decides who may write.
     """
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
-    folder = cache_folder() if folder is None else Path(folder)
+    is_named = folder is not None or bool(os.environ.get("GAVO_CACHE_DIR"))
+    folder = cache_folder() if folder is None else as_path(folder)
+    if folder is None and is_named:
+        _warn(f"{os.environ['GAVO_CACHE_DIR']}: there is no such home folder: nothing is kept")
     keeps_compiled = not os.environ.get("JAX_COMPILATION_CACHE_DIR")
     parts = ["", "traced", "jax", f"jax/{processor_digest()}"][: 4 if keeps_compiled else 2]
-    if folder is None or not all(_is_private(folder / part) for part in parts):
+    if folder is None or not all(_is_private(folder / part, is_named) for part in parts):
         keep_programs_in(None)
         return
     keep_programs_in(folder / "traced")
@@ -88,13 +92,22 @@ def enable_compilation_cache(folder: str | Path | None = None) -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
-def _is_private(folder: Path) -> bool:
-    """Whether programs may be kept in a folder; if others could write to it, a warning says why not."""
+def _is_private(folder: Path, is_named: bool) -> bool:
+    """Whether programs may be kept in a folder; a warning says why not if others could write to it, or if it is one
+    that was asked for.
+    """
     try:
         fault = why_not_private(folder)
-    except OSError:
+    except OSError as error:
+        if is_named:
+            _warn(
+                f"{folder}: cannot be used ({error.strerror or error}): nothing is kept, so every process compiles anew"
+            )
         return False
     if fault:
-        words = f"{folder}: {fault}, and what is kept there is run: nothing is kept; remove it, or close it to others"
-        warnings.warn(words, GavoWarning, stacklevel=4)
+        _warn(f"{folder}: {fault}, and what is kept there is run: nothing is kept; remove it, or close it to others")
     return fault is None
+
+
+def _warn(words: str) -> None:
+    warnings.warn(words, GavoWarning, stacklevel=5)

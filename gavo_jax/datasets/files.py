@@ -161,7 +161,7 @@ class FileSequence:
             calibration = calibration.with_depth_scale(reading.depth_scale)
         self.calibration = calibration
         self._timestamps = np.array([entry.stamp for entry in self.entries])
-        self._images = _Images(self.entries, calibration, reading, self.scale_is_open)
+        self._images = _Images(self.entries, calibration, reading, self.scale_is_open, self.depth_in)
 
     @property
     def timestamps(self) -> Float[np.ndarray, " frames"]:
@@ -395,9 +395,16 @@ def resolve_folder(folder: Path) -> Path:
 class _Images:
     """The kind of a sequence's images, found once from a few of them and shared by its slices."""
 
-    def __init__(self, entries: list[Entry], calibration: Calibration, reading: Reading, scale_is_open: bool):
+    def __init__(
+        self,
+        entries: list[Entry],
+        calibration: Calibration,
+        reading: Reading,
+        scale_is_open: bool,
+        depth_in: Callable[[Path], Depth],
+    ):
         self._entries, self._calibration, self._reading = entries, calibration, reading
-        self._scale_is_open = scale_is_open
+        self._scale_is_open, self._depth_in = scale_is_open, depth_in
 
     @cached_property
     def assembler(self) -> FrameAssembler:
@@ -408,7 +415,7 @@ class _Images:
                 if film_of(entry.color) is None:  # a film's have 8 bits
                     colors.append(read_color(entry.color))
                 if entry.depth is not None:
-                    depths.append(DepthImage(read_depth(entry.depth), str(entry.depth)))
+                    depths.append(DepthImage(self._depth_in(entry.depth), str(entry.depth)))
             except FrameError:
                 continue  # raised when the frame itself is read
         scale = self._calibration.color.depth_scale

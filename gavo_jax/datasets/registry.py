@@ -23,7 +23,7 @@ from gavo_jax.datasets.layouts.tartanair import TartanAir
 from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.layouts.virtual_kitti import VirtualKitti
 from gavo_jax.datasets.recordings.bags import BagSequence
-from gavo_jax.errors import GavoError, blamed
+from gavo_jax.errors import GavoError, as_path, blamed
 
 PLUGINS = "gavo_jax.datasets"
 """Group of entry points by which other packages register kinds of sources."""
@@ -153,7 +153,7 @@ def open_source(path: str | Path, reading: Reading | None = None) -> Sequence:
     Raises:
         GavoError: the path does not exist, its kind is unknown, or the source is faulty.
     """
-    path, reading = Path(path), Reading() if reading is None else reading
+    path, reading = as_path(path), Reading() if reading is None else reading
     if not isinstance(reading, Reading):
         raise GavoError(f"a Reading is needed, not {type(reading).__name__}: gavo.Reading(camera=…)")
     try:

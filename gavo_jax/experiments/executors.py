@@ -79,7 +79,8 @@ class RayExecutor:
         """Join the cluster.
 
         Raises:
-            GavoError: Ray is missing, no cluster answers, or it has too few processors or GPUs for a batch.
+            GavoError: Ray is missing, no cluster answers, Ray refuses the amounts, or no node has enough processors and
+                GPUs for a batch, which then would wait for ever.
         """
         try:
             ray = importlib.import_module("ray")
@@ -92,30 +93,28 @@ class RayExecutor:
                 ray.init(log_to_driver=False, configure_logging=False, include_dashboard=False)
             except (ConnectionError, RuntimeError, ValueError) as error:
                 raise GavoError(f"--executor ray: no cluster: {line_of(error)}") from None
-        resources = ray.cluster_resources()
-        gpus = options.gpus if options.gpus is not None else min(1.0, resources.get("GPU", 0.0))
-        self._wanted = {"CPU": min(options.cpus, resources.get("CPU", 1.0)), "GPU": gpus}
-        for name, amount in self._wanted.items():
-            if amount > resources.get(name, 0.0):
-                raise GavoError(f"--executor ray: a batch takes {amount:g} {name}, the cluster has fewer")
+        self._wanted = self._fitting(options)
+        folder = cache_folder()  # on each node, it holds the programs compiled for that kind of processor
+        try:
+            self._task = ray.remote(_run_cached).options(
+                num_cpus=self._wanted["CPU"],
+                num_gpus=self._wanted["GPU"],
+                max_retries=self.RETRIES,
+                runtime_env={"env_vars": {} if folder is None else {"GAVO_CACHE_DIR": str(folder)}},
+            )
+        except ValueError as error:
+            raise GavoError(f"--executor ray: {line_of(error)}") from None
 
     def slots(self) -> int:
-        """Return how many batches the cluster's processors and GPUs can run at the same time."""
-        resources = self._ray.cluster_resources()
-        return max(1, int(min((resources.get(name, 0.0) // n for name, n in self._wanted.items() if n), default=1)))
+        """Return how many batches the nodes' processors and GPUs can run at the same time."""
+        wanted = {name: amount for name, amount in self._wanted.items() if amount}
+        each = [min((node.get(name, 0.0) // n for name, n in wanted.items()), default=1) for node in self._nodes()]
+        return max(1, int(sum(each)))
 
     def run(self, experiment: str, batches: Sequence[Batch], on_pairs: Callable[[int], None]) -> Iterator[Outcome]:
         """Submit all batches to the cluster and yield their outcomes in order of completion."""
         ray = self._ray
-        folder = cache_folder()  # on each node, it holds the programs compiled for that kind of processor
-        variables = {} if folder is None else {"GAVO_CACHE_DIR": str(folder)}
-        task = ray.remote(_run_cached).options(
-            num_cpus=self._wanted["CPU"],
-            num_gpus=self._wanted["GPU"],
-            max_retries=self.RETRIES,
-            runtime_env={"env_vars": variables},
-        )
-        waiting = {task.remote(experiment, batch): batch for batch in batches}
+        waiting = {self._task.remote(experiment, batch): batch for batch in batches}
         try:
             while waiting:
                 ready, _ = ray.wait(list(waiting), num_returns=1, timeout=1.0)
@@ -135,6 +134,24 @@ class RayExecutor:
         """Shut the cluster down if it was started here."""
         if self._started:
             self._ray.shutdown()
+
+    def _nodes(self) -> list[dict[str, float]]:
+        """Return what each node has in all: a batch runs on one of them."""
+        return [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+
+    def _fitting(self, options: RayOptions) -> dict[str, float]:
+        """Return what a batch takes: of processors at most those of one node; too few GPUs are a fault."""
+        nodes = [(node.get("CPU", 0.0), node.get("GPU", 0.0)) for node in self._nodes()]
+        most = max((gpus for _, gpus in nodes), default=0.0)
+        wanted = options.gpus if options.gpus is not None else min(1.0, most)
+        if wanted > most:
+            raise GavoError(
+                f"--executor ray: a batch takes {wanted:g} GPU, no node of the cluster has more than {most:g}"
+            )
+        processors = min(options.cpus, max((cpus for cpus, gpus in nodes if gpus >= wanted), default=0.0))
+        if not processors and options.cpus:
+            raise GavoError(f"--executor ray: a batch takes {options.cpus:g} CPU, the nodes that it fits have none")
+        return {"CPU": processors, "GPU": wanted}
 
 
 def _run_cached(experiment: str, batch: Batch) -> Outcome:

@@ -122,7 +122,7 @@ def parts_of(path: Path, table: Mapping[str, Any]) -> tuple[list[Part], dict[str
 
 def _find(beside: Path, patterns: Sequence[str]) -> list[str]:
     """Folders of the first pattern that matches any: in the working directory, beside the file, or in GAVO_DATA."""
-    roots = ["", str(beside), *([os.environ[DATA]] if os.environ.get(DATA) else [])]
+    roots = ["", str(beside), *([os.path.expanduser(os.environ[DATA])] if os.environ.get(DATA) else [])]
     for pattern in patterns:
         if pattern == SYNTHETIC:
             return [SYNTHETIC]

@@ -92,7 +92,7 @@ class Table:
         """
         parquet = _parquet()
         if not self.done():
-            raise GavoError(f"{self.folder}: no results of an experiment")
+            raise GavoError(f"{self.folder.parent}: no results of an experiment: {self._lacking()}")
         rows = []
         for run in sorted(self.done()):
             path = self.folder / f"{run}{SUFFIX}"
@@ -104,6 +104,12 @@ class Table:
                 raise GavoError(f"{path}: not a row of results: {fault}")
             rows += found
         return rows
+
+    def _lacking(self) -> str:
+        """Say why there are no rows."""
+        if self.folder.is_dir():
+            return f"no rows in its folder {ROWS}"
+        return "name the folder above it" if Table(self.folder.parent.parent).done() else f"no folder {ROWS} in it"
 
 
 def _fault(rows: list[dict[str, Any]], run: str) -> str:

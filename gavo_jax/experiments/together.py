@@ -256,7 +256,11 @@ def _row(stack: Any, i: int) -> TrackerState:
 
 
 def _over_devices(rows: int) -> NamedSharding:
-    """Sharding of a leading axis over gcd(rows, number of devices) of the local devices."""
+    """Sharding of a leading axis over gcd(rows, number of devices) of the local devices.
+
+    Each device gets the same number of rows, so 4 runs on 3 devices use one of them: choose the size of batches as a
+    multiple of the number of devices.
+    """
     devices = jax.local_devices()
     count = math.gcd(rows, len(devices))
     return NamedSharding(Mesh(np.array(devices[:count]), ("runs",)), PartitionSpec("runs"))

@@ -46,6 +46,7 @@ class Tuning:
         preset: Preset that supplies all settings outside `space`.
         trials: Number of finished trials to reach.
         space: By dotted name of a hyperparameter, a list of choices or a table of `low`, `high`, `step`, `log`.
+        skipped: One line for each missing optional sequence.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Tuning:
     preset: str
     trials: int
     space: Mapping[str, Any]
+    skipped: tuple[str, ...]
 
 
 class Choice(NamedTuple):
@@ -79,7 +81,7 @@ def read_tuning(path: str | Path, output: str | Path | None = None) -> Tuning:
     table = read_toml(path)
     refuse_unknown(str(path), table, KEYS)
     name = text_of(f"{path}: name", table.get("name", path.stem))
-    parts, _ = parts_of(path, table)
+    parts, skipped = parts_of(path, table)
     method, preset = table.get("method", "ga"), table.get("preset", "default")
     refuse_unknown_method(f"{path}: method", str(method))
     refuse_unknown(f"{path}: preset", [str(preset)], PRESETS, "name")
@@ -102,6 +104,7 @@ def read_tuning(path: str | Path, output: str | Path | None = None) -> Tuning:
         preset,
         whole_of(f"{path}: trials", table.get("trials", TRIALS), 1),
         space,
+        tuple(skipped.values()),
     )
 
 

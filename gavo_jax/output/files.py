@@ -15,7 +15,7 @@ import cv2
 import jax
 import numpy as np
 
-from gavo_jax.errors import PARTIAL, GavoError
+from gavo_jax.errors import PARTIAL, GavoError, as_path
 from gavo_jax.output.plots import CAPTIONS as FIGURES
 from gavo_jax.output.plots import FORMATS as FIGURE_FORMATS
 from gavo_jax.settings import Settings
@@ -106,7 +106,7 @@ def prepare_folder(folder: str | Path) -> Path:
     Raises:
         GavoError: It is not a folder or cannot be written to.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     try:
         if folder.exists() and not folder.is_dir():
             raise GavoError(f"{folder}: output folder is not a folder")

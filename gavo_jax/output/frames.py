@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gavo_jax.alignment.result import no_alignment
-from gavo_jax.errors import GavoError, read_json_object, read_text
+from gavo_jax.errors import GavoError, read_json_object, read_text, shown
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.hindsight import revised
-from gavo_jax.output.files import CONFIG, FRAMES, ODOMETRY, TRAJECTORY
+from gavo_jax.output.files import CONFIG, FRAMES, METRICS, ODOMETRY, TRAJECTORY
 from gavo_jax.status import AlignmentStatus, bit
 from gavo_jax.trajectory import Trajectory, inverse, stamp_name
 
@@ -53,15 +53,17 @@ def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]
     steps: list[Step] = []
     place = now = 0
     rows = _rows_of(folder / FRAMES)
-    while len(rows) > 1 and len(rows) >= len(poses) and rows[-1]["timestamp"] not in {**by_stamp, **found_at}:
-        rows.pop()  # its pose is not written yet
+    while len(rows) > 1 and len(rows) >= len(poses) and _lacks_pose(rows[-1], {**by_stamp, **found_at}):
+        rows.pop()  # its pose was not written yet
     for number, row in enumerate(rows, start=1):
         try:
             stamp = float(row["timestamp"])
             if int(row["index"]) != number:
                 raise ValueError("a row is missing")
-            if row["status"] != str(AlignmentStatus.BAD_TIMESTAMP):
-                _require_pose(folder, row["timestamp"], by_stamp, found_at)
+            for name, stamps in ((TRAJECTORY, by_stamp), (ODOMETRY, found_at)):
+                if _lacks_pose(row, stamps):
+                    of = f"{name} and {FRAMES} are not of the same run"
+                    raise GavoError(f"{folder}: {of}: no pose at {row['timestamp']}")
             if row["timestamp"] in by_stamp:
                 place = by_stamp[row["timestamp"]]
                 stamp = float(poses.timestamps[place])
@@ -86,11 +88,9 @@ def _rows_of(path: Path) -> list[dict[str, str]]:
         raise GavoError(f"{path}: not a table of frames: {error}") from None
 
 
-def _require_pose(folder: Path, stamp: str, poses: Mapping[str, int], found: Mapping[str, int]) -> None:
-    """Raise GavoError if a frame of frames.csv has no pose."""
-    for name, stamps in ((TRAJECTORY, poses), (ODOMETRY, found)):
-        if stamp not in stamps:
-            raise GavoError(f"{folder}: {name} and {FRAMES} are not of the same run: no pose at {stamp}")
+def _lacks_pose(row: Mapping[str, str], stamps: Mapping[str, int]) -> bool:
+    """Whether a frame should have a pose, and has none."""
+    return row.get("timestamp") not in stamps and row.get("status") != str(AlignmentStatus.BAD_TIMESTAMP)
 
 
 def _read_step(
@@ -185,7 +185,7 @@ def read_run(folder: str | Path) -> RecordedRun:
     """Read the files of a run, finished or not.
 
     Raises:
-        GavoError: A file is missing or damaged, or trajectory.txt and frames.csv are from different runs.
+        GavoError: A file is missing, damaged or cut off, or trajectory.txt and frames.csv are from different runs.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -197,7 +197,12 @@ def read_run(folder: str | Path) -> RecordedRun:
     # a killed run with loops has only the poses as tracked
     is_cut_short = not (folder / TRAJECTORY).exists() and (folder / ODOMETRY).exists()
     trajectory = Trajectory.read_tum(folder / (ODOMETRY if is_cut_short else TRAJECTORY))
-    return RecordedRun(config, trajectory, revised(read_steps(folder, trajectory)))
+    steps = read_steps(folder, trajectory)
+    pairs = read_json_object(folder / METRICS).get("pairs") if (folder / METRICS).exists() else None
+    if pairs not in (None, len(steps)):  # metrics.json is written last
+        told = f"{len(steps)} pairs in {TRAJECTORY} and {FRAMES}, and {shown(pairs)} in {METRICS}"
+        raise GavoError(f"{folder}: {told}: files cut off, or of another run")
+    return RecordedRun(config, trajectory, revised(steps))
 
 
 def _digits(value: Any) -> str:

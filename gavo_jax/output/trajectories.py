@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.errors import GavoError, partial_of
+from gavo_jax.errors import GavoError, as_path, partial_of
 from gavo_jax.output.files import TRAJECTORY, json_text, remove_files
 from gavo_jax.trajectory import Trajectory, quaternion_from_rotation, require_trajectory, write_lines
 
@@ -57,7 +57,7 @@ def write_trajectory(trajectory: Trajectory, path: str | Path, form: str) -> Non
     trajectory.require_rigid()
     if not np.isfinite(trajectory.timestamps).all():
         raise GavoError(f"{path}: pose {np.argmin(np.isfinite(trajectory.timestamps))} has a stamp that is no number")
-    WRITERS[form](trajectory, Path(path))
+    WRITERS[form](trajectory, as_path(path))
 
 
 def check_format(form: str) -> None:

@@ -62,7 +62,8 @@ class SmallGicpPeer:
         cloud = point_cloud(frame, self._camera)
         if len(cloud) < self.NEIGHBOURS:
             return None
-        return self._library.preprocess_points(cloud, self.RESOLUTION, self.NEIGHBOURS, self.THREADS)
+        prepared = self._library.preprocess_points(cloud, self.RESOLUTION, self.NEIGHBOURS, self.THREADS)
+        return None if prepared[0].size() < self.NEIGHBOURS else prepared
 
     def align(self, reference: Any, target: Any) -> PeerResult:
         """Align two prepared frames from a zero guess."""

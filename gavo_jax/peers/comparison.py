@@ -21,8 +21,8 @@ from gavo_jax.status import AlignmentStatus
 class PeerAligner:
     """Adapts a peer to an aligner: from frame to frame, without a prior or a second attempt.
 
-    A pair on which the peer fails is unusable, and its status is `NOT_FINITE`. Only `target_T_reference` and `status`
-    of the alignments are meaningful.
+    A pair on which the peer fails is unusable, and its status is `HIGH_ERROR`, as peers don't say why. Only
+    `target_T_reference` and `status` of the alignments are meaningful.
     """
 
     peer: Peer
@@ -40,7 +40,7 @@ class PeerAligner:
         del clock
         prepared = self.peer.prepare(frame)
         found = self.peer.align(state, prepared)
-        status = AlignmentStatus.OK if found.success else AlignmentStatus.NOT_FINITE
+        status = AlignmentStatus.OK if found.success else AlignmentStatus.HIGH_ERROR
         result = no_alignment(status)._replace(target_T_reference=found.target_T_reference)
         return Attempt(prepared, result, found.success)
 

@@ -113,12 +113,31 @@ def test_a_folder_in_ones_home_needs_no_shell(tmp_path, monkeypatch):
     assert cache_folder() == tmp_path / "kept"
 
 
-def test_no_folder_is_no_warning(tmp_path):
+@pytest.mark.parametrize("end", ["", "cache"])
+@pytest.mark.parametrize("named", ["as an argument", "by GAVO_CACHE_DIR", "as the user's own"])
+def test_only_a_folder_that_was_asked_for_is_missed(tmp_path, monkeypatch, named, end):
+    """Whoever named one waited for every compilation without a word of why."""
     (tmp_path / "file").touch()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        enable_compilation_cache(tmp_path / "file" / "cache")
+    folder = tmp_path / "file" / end
+    monkeypatch.delenv("GAVO_CACHE_DIR", raising=False)
+    if named == "by GAVO_CACHE_DIR":
+        monkeypatch.setenv("GAVO_CACHE_DIR", str(folder))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        enable_compilation_cache(folder if named == "as an argument" else None)
     assert programs._folder is None
+    if named == "as the user's own":
+        assert not said
+    else:
+        assert len(said) == 1 and said[0].category is GavoWarning
+        assert str(said[0].message).startswith(f"{folder}: cannot be used (Not a directory): nothing is kept")
+
+
+def test_a_home_that_is_not_there_is_missed(monkeypatch):
+    monkeypatch.setenv("GAVO_CACHE_DIR", "~nobody-of-this-name/kept")
+    with pytest.warns(GavoWarning, match="no such home folder: nothing is kept"):
+        enable_compilation_cache()
 
 
 def test_the_command_goes_on_with_one_line(tmp_path):

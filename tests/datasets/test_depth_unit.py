@@ -2,14 +2,17 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from written_folders import CAMERA, LAYOUTS, METRES, image, kinect, raw
 
 from gavo_jax.camera import Camera
+from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.datasets.depth_unit import better_scale, doubt_of_scale, sample_depth
-from gavo_jax.datasets.files import Reading
+from gavo_jax.datasets.files import Entry, FileSequence, Reading
+from gavo_jax.datasets.images import read_depth
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.datasets.rendered.sensor_noise import KINECT
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
@@ -175,3 +178,19 @@ def test_the_rendered_room():
         images = [frame.depth for frame in SyntheticSequence(frames=3, noise=KINECT, camera=camera)]
         sample = sample_depth(images)
         assert sample is not None and better_scale(sample, said, camera) == right
+
+
+def test_a_source_that_reads_depth_in_its_own_way_is_sampled_so(tmp_path):
+    """The unit was that of whole numbers, as the file holds them, and not of the metres that the source makes of it."""
+
+    class Packed(FileSequence):
+        @classmethod
+        def depth_in(cls, file: Path) -> np.ndarray:
+            return (read_depth(file) / 256).astype(np.float32)
+
+    image(tmp_path / "colour.png", np.full((120, 160), 90, np.uint8))
+    image(tmp_path / "depth.png", raw(METRES[0], 256))
+    entries = [Entry(0.0, tmp_path / "colour.png", tmp_path / "depth.png")]
+    sequence = Packed("packed", entries, Calibration(CAMERA, states_depth_scale=False))
+    metres = sequence[0].depth / sequence.camera.depth_scale
+    assert np.median(np.abs(metres - METRES[0])) < 0.01

@@ -176,6 +176,24 @@ def test_an_address_that_is_none_is_one_line(server: Server, tmp_path: Path, mon
     assert capsys.readouterr().err.count("\n") == 1
 
 
+@pytest.mark.parametrize("address", ["foo", "-1", "/srv/tum", "ftp://x/", "http://"])
+def test_an_address_of_no_server_names_the_variable(server: Server, tmp_path: Path, monkeypatch, capsys, address: str):
+    """It was said to have broken off five times."""
+    monkeypatch.setenv("GAVO_TUM_SERVER", address)
+    assert main(["download", "fr1_xyz", "--to", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith("gavo: GAVO_TUM_SERVER: not the address of a server")
+
+
+def test_data_in_ones_home_needs_no_shell(server: Server, tmp_path: Path, monkeypatch):
+    """A folder ~ was made in the working directory."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("GAVO_TUM_SERVER", server.url)
+    monkeypatch.setenv("GAVO_DATA", "~/data")
+    monkeypatch.chdir(tmp_path)
+    assert main(["download", "fr1_xyz"]) == 0
+    assert is_whole(tmp_path / "home" / "data" / FOLDER, tmp_path / "home" / "data")
+
+
 def test_names_in_an_archive_do_not_command_the_terminal(server: Server, tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setenv("GAVO_TUM_SERVER", server.url)
     server.content = archive(member("\x1b]0;gotcha\x07\x1b[31m\x9b31m\u202eevil.txt"))

@@ -198,6 +198,14 @@ def test_tune(tuned, tmp_path, capsys, monkeypatch):
     assert set(front[0]["settings"]) == {"solver.damping", "solver.iterations.4", "alignment.robust_scale"}
 
 
+def test_a_study_says_which_sequences_it_skips(tuned, tmp_path, capsys, monkeypatch):
+    """An optional one that is missing was left out without a word, as if the front were of all of them."""
+    monkeypatch.setattr(tuning, "measure", lambda *_: (0.1, 1.0))
+    tuned.write_text(tuned.read_text() + '\n[[sequences]]\npath = "nowhere"\noptional = true\n')
+    assert main(["tune", str(tuned), "--output", str(tmp_path / "study")]) == 0
+    assert "skipped nowhere: nowhere: no such folder" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("drifts", [(np.inf, 0.1, np.inf), (np.inf,)])
 def test_a_trial_that_loses_the_camera_is_one_of_many(tuned, tmp_path, capsys, monkeypatch, drifts):
     """It ended the study, which said that there was no ground truth."""

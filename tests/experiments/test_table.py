@@ -1,6 +1,7 @@
 """The results table under several writers."""
 
 import multiprocessing
+import re
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import pytest
 
 from gavo_jax.cli import main
 from gavo_jax.errors import GavoError
-from gavo_jax.experiments.table import COLUMNS, FLAG, REAL, TEXT, Table
+from gavo_jax.experiments.table import COLUMNS, FLAG, REAL, ROWS, TEXT, Table
 
 
 def row(run: str, drift: float | None = 0.01) -> dict[str, Any]:
@@ -68,8 +69,16 @@ def test_a_torn_file_is_named_and_a_partial_one_is_no_row(tmp_path):
 
 
 def test_no_table(tmp_path):
-    with pytest.raises(GavoError, match="no results"):
-        Table(tmp_path / "nowhere").read()
+    """The message named a folder that is not there."""
+    where = re.escape(str(tmp_path))
+    with pytest.raises(GavoError, match=f"^{where}: no results of an experiment: no folder runs in it$"):
+        Table(tmp_path).read()
+    (tmp_path / ROWS).mkdir()
+    with pytest.raises(GavoError, match=f"^{where}: no results of an experiment: no rows in its folder runs$"):
+        Table(tmp_path).read()
+    Table(tmp_path).append(row("a"))
+    with pytest.raises(GavoError, match=f"^{where}/runs: no results of an experiment: name the folder above it$"):
+        Table(tmp_path / ROWS).read()
 
 
 def test_any_parquet_reader_sees_one_table(tmp_path):

@@ -156,6 +156,7 @@ def altered(words: str, row: int = 1) -> Callable[[Path], None]:
         (lambda folder: (folder / "odometry.txt").write_text("7 0 0 0 0 0 0 1\n8 0 0 0 0 0 0 1\n"), "odometry.txt"),
         (altered(""), "frames.csv:2: not row 1 of a run"),
         (altered("1," + "x" * 200_000), "frames.csv"),
+        (lambda folder: (folder / "frames.csv").write_text("a,b\n" + "1,2\n" * 4), "frames.csv:2: not row 1 of a run"),
     ],
 )
 def test_files_that_are_not_of_one_run_are_told(tmp_path, damage, words):
@@ -170,6 +171,30 @@ def test_a_row_whose_pose_is_not_written_yet_is_left_out(tmp_path):
     poses = recorded(tmp_path / "run") / "trajectory.txt"
     poses.write_text("\n".join(poses.read_text().splitlines()[:-1]) + "\n")
     assert len(read_run(tmp_path / "run").steps) == 2
+
+
+def test_a_last_row_without_a_pose_stays_if_its_stamp_is_in_doubt(tmp_path: Path) -> None:
+    """It was taken for one whose pose was not written yet: the run had a pair fewer."""
+    with RunFolder(tmp_path) as run:
+        run.start({}, 0.0)
+        for index, status in enumerate((AlignmentStatus.OK, AlignmentStatus.BAD_TIMESTAMP), start=1):
+            run.add(Step(index, 0.0, index / 10, no_alignment(status), np.eye(4), 1.0, index == 2))
+        assert len(run.steps()) == 2
+    assert len(read_run(tmp_path).steps) == 2
+
+
+@pytest.mark.parametrize("name", ["frames.csv", "trajectory.txt"])
+def test_a_finished_run_is_whole(tmp_path: Path, name: str) -> None:
+    """`gavo view` showed what was left of it, as if it were still going on."""
+    folder = recorded(tmp_path / "run")
+    write_json(folder / "metrics.json", {"pairs": 3})
+    assert len(read_run(folder).steps) == 3
+    lines = (folder / name).read_text().splitlines()
+    (folder / name).write_text("\n".join(lines[:-1]) + "\n")
+    with pytest.raises(
+        GavoError, match="2 pairs in trajectory.txt and frames.csv, and 3 in metrics.json: files cut off"
+    ):
+        read_run(folder)
 
 
 def test_a_run_with_loops_that_was_killed_is_read(tmp_path):

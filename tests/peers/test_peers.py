@@ -3,6 +3,8 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +14,13 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.errors import GavoError
+from gavo_jax.odometry.tracking import Clock
+from gavo_jax.peers import clouds
+from gavo_jax.peers.base import failure
+from gavo_jax.peers.clouds import SmallGicpPeer
+from gavo_jax.peers.comparison import PeerAligner
 from gavo_jax.peers.registry import PEERS, Peer, make_peer
+from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 CAMERA = Camera(fx=260.0, fy=258.0, cx=159.5, cy=119.5, width=320, height=240)
@@ -152,6 +160,31 @@ def test_missing_cloud_library_names_the_extra(monkeypatch: pytest.MonkeyPatch, 
         monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(GavoError, match=r"gavo-jax\[peers\]"):
         make_peer(name, CAMERA)
+
+
+def test_a_cloud_of_a_few_voxels_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Points were counted before downsampling: a patch of depth that left five of them was aligned, and called ok."""
+    kept = {"points": SmallGicpPeer.NEIGHBOURS - 1}
+    library: Any = ModuleType("small_gicp")
+    library.preprocess_points = lambda *_: (SimpleNamespace(size=lambda: kept["points"]), None)
+    library.align = lambda *_, **__: SimpleNamespace(T_target_source=np.eye(4), converged=True)
+    monkeypatch.setitem(sys.modules, "small_gicp", library)
+    monkeypatch.setattr(clouds, "_version", lambda _: "1.0")
+    peer = make_peer("small-gicp", CAMERA)
+    frame = render(np.eye(4))
+    few = peer.prepare(frame)
+    kept["points"] += 1
+    enough = peer.prepare(frame)
+    assert not peer.align(few, enough).success and not peer.align(enough, few).success
+    assert peer.align(enough, enough).success
+
+
+def test_a_peer_that_fails_says_nothing_about_numbers() -> None:
+    """The pair was `not_finite`, which docs/frames.md says of an image with NaN."""
+    peer: Any = SimpleNamespace(prepare=lambda frame: frame, align=lambda *_: failure())
+    frame = render(np.eye(4))
+    attempt = PeerAligner(peer).align(frame, frame, Clock(np.float32(1 / 30), np.float32(0), np.uint32(1)))
+    assert not attempt.usable and attempt.result.status is AlignmentStatus.HIGH_ERROR
 
 
 def test_wrong_size_is_refused(peer: Peer) -> None:

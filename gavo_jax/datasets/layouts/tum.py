@@ -27,7 +27,7 @@ from gavo_jax.datasets.files import (
 )
 from gavo_jax.datasets.names import decimal_unit, filled_in, unit_of, unpaired
 from gavo_jax.datasets.truth import Seconds, truth_in, unread_truth
-from gavo_jax.errors import GavoError, data_rows, number, without_heading
+from gavo_jax.errors import GavoError, as_path, data_rows, number, without_heading
 from gavo_jax.trajectory import Trajectory, associate
 
 MAX_DIFFERENCE = 0.02
@@ -106,7 +106,7 @@ class TumSequence(FileSequence):
             GavoError: missing folder or list, malformed row (file:line), a path that leaves the folder, no pair
                 of stamps near enough, unusable ground truth, or unknown camera.
         """
-        self.folder = Path(folder)
+        self.folder = as_path(folder)
         resolved = resolve_folder(self.folder)
         reading = Reading("auto" if camera is None else camera, depth_scale, rate, color, undistort, max_difference)
         lists = _read_lists(resolved, self.folder, self.LISTS, rate)
@@ -269,7 +269,7 @@ def _read_pairs(root: Path, path: Path) -> tuple[list[_Row], list[_Row]]:
     for place, fields in without_heading(data_rows(path, MAX_LIST_BYTES))[1]:
         if len(fields) != 4:
             aside = ": without this file, images are paired by their names" if len(fields) == 2 else ""
-            raise GavoError(f"{place}: expected `stamp path stamp path`, found {len(fields)} fields{aside}")
+            raise GavoError(f"{place}: expected `stamp path stamp path`, {_found(fields)}{aside}")
         pair = [_row(root, path, place, *fields[at : at + 2]) for at in (0, 2)]
         pairs.append(pair[::-1] if fields[1].count("depth") > fields[3].count("depth") else pair)
     color, depth = (_in_time(path, [pair[at] for pair in pairs]) for at in (0, 1))
@@ -281,9 +281,14 @@ def _read_list(root: Path, path: Path) -> list[_Row]:
     rows: list[_Row] = []
     for place, fields in without_heading(data_rows(path, MAX_LIST_BYTES))[1]:
         if len(fields) != 2:
-            raise GavoError(f"{place}: expected `timestamp path`, of no blanks, found {len(fields)} fields")
+            raise GavoError(f"{place}: expected `timestamp path`, of no blanks, {_found(fields)}")
         rows.append(_row(root, path, place, *fields))
     return _in_time(path, rows)
+
+
+def _found(fields: list[str]) -> str:
+    """Say what a row holds: the file may be of something else."""
+    return f"found {len(fields)} field{'s' * (len(fields) != 1)}: {' '.join(fields)[:60]!r}"
 
 
 def _row(root: Path, path: Path, place: str, time: str, image: str) -> _Row:

@@ -11,7 +11,7 @@ import numpy as np
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, Sequence, require_sequence
 from gavo_jax.datasets.rendered.bodies_truth import MASKS, WithBodies, write_mask, write_truth
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, as_path
 
 WRITTEN = ("camera", "__iter__", "name", "ground_truth")
 """Members of `Sequence` that are needed to write it."""
@@ -30,7 +30,7 @@ def write_tum(sequence: Sequence, folder: str | Path) -> None:
         FrameError: a frame of the sequence cannot be read.
     """
     require_sequence(sequence, WRITTEN)
-    folder = Path(folder)
+    folder = as_path(folder)
     if (folder / "rgb.txt").exists():
         raise GavoError(f"{folder}: holds a sequence already (rgb.txt)")
     try:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from gavo_jax.datasets.rendered.moving import MovingBody, MovingPart, Path
 from gavo_jax.datasets.rendered.room import Box
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, as_number, shown
 
 _STREAM = 3
 BOX_PLACES = ((0.0, 1.0), (0.75, 1.0), (-0.75, 1.0), (0.4, 1.6), (-0.4, 1.6), (1.1, 1.6))
@@ -25,6 +25,8 @@ _LOOKS = (
     ("plain", (1.1, 1.0, 0.9)),
 )
 _TALL, _GROWN_UP = 1.05, 1.75
+_LOOK = ("yaw", "tint")
+"""Fields of `Box` that a moving box may be given."""
 _BOX_SPEED, _WALK_SPEED = 0.35, 0.4
 
 
@@ -132,7 +134,14 @@ def box(name: str, size: tuple[float, float, float], path: Path, texture: str = 
         path: of its centre.
         texture: one of `textures.TEXTURES`.
         look: further fields of `Box`, such as `tint`.
+
+    Raises:
+        GavoError: the size is not three numbers, or `Box` has no such field.
     """
+    if np.shape(size) != (3,):
+        raise GavoError(f"box {shown(name)}: size: three edge lengths are needed, not {shown(size)}")
+    if unknown := [field for field in look if field not in _LOOK]:
+        raise GavoError(f"box {shown(name)}: {unknown[0]}: not one of {', '.join(_LOOK)}")
     return MovingBody(name, (MovingPart((Box((0.0, 0.0, -size[2] / 2), size, texture, **look),), path),))
 
 
@@ -144,7 +153,14 @@ def figure(name: str, walk: Walk, tall: float = _GROWN_UP, phase: float = 0.0) -
         walk: path of the point on the floor below it.
         tall: height, metres.
         phase: of the swing, radians.
+
+    Raises:
+        GavoError: the path is no `Walk`, or the height is not above 0.
     """
+    if not as_number(f"figure {shown(name)}: tall", tall) > 0:
+        raise GavoError(f"figure {shown(name)}: tall: must be above 0, not {tall}")
+    if not hasattr(walk, "speed"):
+        raise GavoError(f"figure {shown(name)}: a Walk is needed, not {shown(walk)}")
     scale = tall / _GROWN_UP
     rate = walk.speed / (1.3 * scale)
 

@@ -331,6 +331,8 @@ def test_undistortion_belongs_to_the_sequence(folder):
         (lambda f: (f / "rgb.txt").unlink(), "rgb.txt: no such file"),
         (lambda f: (f / "depth.txt").unlink(), "depth.txt: no such file"),
         (lambda f: (f / "rgb.txt").write_text("# nothing\n"), "rgb.txt: lists no images"),
+        (lambda f: (f / "rgb.txt").write_text("colours of our logo\n"), "found 4 fields: 'colours of our logo'"),
+        (lambda f: (f / "rgb.txt").write_text("colours\n"), "found 1 field: 'colours'"),
         (lambda f: (f / "rgb.txt").write_bytes(b"\xff\xfe\x00"), "rgb.txt: not a text"),
         (lambda f: edit(f / "depth.txt", "depth/2.png", "depth/2.png\nnot a line at all"), "depth.txt:5: "),
         (lambda f: edit(f / "depth.txt", "depth/2.png", ""), "depth.txt:4: "),

@@ -1,6 +1,7 @@
 """Bodies in the synthetic room: their truth fits what is seen, and nothing else changes."""
 
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.layouts.tum_writing import write_tum
-from gavo_jax.datasets.rendered.actors import MOST_BODIES, Sway, box
+from gavo_jax.datasets.rendered.actors import MOST_BODIES, Sway, Walk, box, figure
 from gavo_jax.datasets.rendered.bodies_truth import MASKS, TRUTH
 from gavo_jax.datasets.rendered.moving import BodyTruth, MovingBody, MovingPart
 from gavo_jax.datasets.rendered.room import Box
@@ -177,3 +178,16 @@ def test_bodies_that_cannot_be_are_refused(bodies: int | list[MovingBody], word:
     with pytest.raises(GavoError, match=word) as caught:
         SyntheticSequence(frames=2, camera=TINY, bodies=bodies)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("size", [None, 3, (1.0, 1.0), "big"])
+def test_what_is_no_box_or_figure_is_refused_at_once(size: Any) -> None:
+    """It was a fault of Python's, about a subscript or an attribute."""
+    with pytest.raises(GavoError, match="box 'a': size: three edge lengths are needed"):
+        box("a", size, Sway(np.eye(4)))
+    with pytest.raises(GavoError, match="box 'a': colour: not one of yaw, tint"):
+        box("a", (1.0, 1.0, 1.0), Sway(np.eye(4)), colour=size)
+    with pytest.raises(GavoError, match="figure 'a': a Walk is needed"):
+        figure("a", size)
+    with pytest.raises(GavoError, match="figure 'a': tall"):
+        figure("a", Walk((0.0, 0.0, 0.0), 0.0), 0.0)
