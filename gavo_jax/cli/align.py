@@ -14,7 +14,8 @@ from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.cli.options import Align
 from gavo_jax.cli.readiness import be_ready
 from gavo_jax.cli.selection import check_positive, choose_settings
-from gavo_jax.datasets.depth_unit import fault_of_scale, lack_of_depth
+from gavo_jax.datasets.depth_doubts import fault_of_depth
+from gavo_jax.datasets.depth_unit import lack_of_depth
 from gavo_jax.datasets.files import (
     Entry,
     FileSequence,
@@ -52,7 +53,7 @@ def align(options: Align) -> int:
     if not options.force:
         faults = [
             (options.depth0, lack_of_depth(pair)),
-            *((images[k][1], fault_of_scale(pair[k : k + 1])) for k in (0, 1)),
+            *((images[k][1], fault_of_depth(pair[k : k + 1])) for k in (0, 1)),
         ]
         for depth, fault in faults:
             if fault:
