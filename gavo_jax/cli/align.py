@@ -16,15 +16,8 @@ from gavo_jax.cli.readiness import be_ready
 from gavo_jax.cli.selection import check_positive, choose_settings
 from gavo_jax.datasets.depth_doubts import fault_of_depth
 from gavo_jax.datasets.depth_unit import lack_of_depth
-from gavo_jax.datasets.files import (
-    Entry,
-    FileSequence,
-    Reading,
-    open_pair,
-    own_camera_file,
-    preset_by_name,
-    size_of_most,
-)
+from gavo_jax.datasets.files import Entry, FileSequence, Reading, open_pair, size_of_most
+from gavo_jax.datasets.own_camera import own_camera_file, preset_by_name
 from gavo_jax.datasets.registry import open_source, source_around
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import rotation_angle
