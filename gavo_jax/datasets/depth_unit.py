@@ -154,10 +154,12 @@ def fault_of_scale(sequence: FrameSequence) -> str | None:
             f"depth with depth_scale {scale:g} has a median of {sample.median / scale:.3g} m: it looks like "
             f"{name_of_unit(better)}: set --depth-scale {better:g}"
         )
-    if getattr(sequence, "unit_is_assumed", False) and sample.is_whole and sample.median / scale > DEPTH_RANGE[1]:
+    median, in_other = sample.median / scale, _in_another_unit(sample, scale)
+    is_guess = sample.is_whole and getattr(sequence, "unit_is_assumed", False)
+    if is_guess and (median > DEPTH_RANGE[1] or median < DEPTH_RANGE[0] and in_other):
         return (
-            f"depth in {name_of_unit(scale)}, a guess, has a median of {sample.median / scale:.3g} m: set "
-            f"--depth-scale, units per metre{_in_another_unit(sample, scale)}{_as_halves(sample)}"
+            f"depth in {name_of_unit(scale)}, a guess, has a median of {median:.3g} m: set --depth-scale, units per "
+            f"metre{in_other}{_as_halves(sample)}"
         )
     return None
 

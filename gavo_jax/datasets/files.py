@@ -18,7 +18,7 @@ from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler, co
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.datasets.depth_unit import better_scale, sample_depth
 from gavo_jax.datasets.films import file_of, film_of, read_frame
-from gavo_jax.datasets.images import read_color, read_depth
+from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_color, read_depth
 from gavo_jax.errors import GavoError, as_number
 from gavo_jax.image.numbers import Depth
 from gavo_jax.trajectory import Trajectory
@@ -244,7 +244,7 @@ class FileSequence:
         for entry in self.entries:
             for path in (entry.color, entry.depth):
                 if path is not None and not os.path.isfile(file_of(path)):
-                    raise GavoError(f"{path}: {_instead(path)}: restore it, or leave its frame out")
+                    raise GavoError(f"{path}: {_instead(path)}")
         self[0]
 
 
@@ -289,10 +289,17 @@ def places_of_a_few(count: int) -> list[int]:
 
 
 def _instead(path: Path) -> str:
-    """Describe what is at the path of an image that is not a file."""
+    """Describe what is at the path of an image that is not a file, and what helps."""
+    endings = {*COLOR_SUFFIXES, *DEPTH_SUFFIXES}
+    stem = path.stem if path.suffix.lower() in endings else path.name
+    other = next((name for ending in sorted(endings) if os.path.isfile(path.parent / (name := stem + ending))), None)
     if os.path.islink(path):  # False, without raising, for a name that is too long
-        return f"a link to {os.readlink(path)[:200]}, which is missing"
-    return "not a file" if os.path.exists(path) else "image is missing"
+        there = f"a link to {os.readlink(path)[:200]}, which is missing"
+    elif other is not None:
+        return f"image is missing, but {other[:200]} is there: correct the list, or leave its frame out"
+    else:
+        there = "not a file" if os.path.exists(path) else "image is missing"
+    return f"{there}: restore it, or leave its frame out"
 
 
 def resolve_folder(folder: Path) -> Path:

@@ -136,14 +136,16 @@ def missing_images(path: Path) -> str | None:
         if not images_among(folder.glob("*"), (*suffixes, ".npy")):
             inside = sorted(folder.glob("*"))
             names = ", ".join(child.name[:60] for child in inside[:2]) or "empty"
-            hint = _instead_of_images(kind, inside) or f"those end in {', '.join(suffixes)}"
+            hint = _instead_of_images(kind, folder.name, inside) or f"those end in {', '.join(suffixes)}"
             return f"no {kind} images in {folder.name} ({names}): {hint}"
     return None
 
 
-def _instead_of_images(kind: str, inside: list[Path]) -> str:
+def _instead_of_images(kind: str, folder: str, inside: list[Path]) -> str:
     """Advice on what lies in a folder in place of images; empty if there is none."""
     endings = {child.suffix.lower() for child in inside}
+    if inside and all(child.is_dir() for child in inside):
+        return f"where they lie in {inside[0].name[:60]}/, link that as {folder}/"
     if kind == "colour" and len(inside) == 1 and endings & {*FILMS}:
         return f"a film goes beside that folder, as rgb{inside[0].suffix}"
     if kind == "depth" and endings & {".jpg", ".jpeg", ".webp"}:

@@ -24,6 +24,10 @@ BY_FILM = "as the film says"
 """Value of `times_guessed` for stamps from frame numbers at a film's rate."""
 
 
+TIMES = ("timestamps.txt", "timestamp.txt", "times.txt", "timestamps.csv")
+"""Names under which programs list the times of frames."""
+
+
 class PlainFolder(FileSequence):
     """A folder of colour and a folder of depth images, or one folder of both, distinguished by name.
 
@@ -73,9 +77,9 @@ class PlainFolder(FileSequence):
         if cls.depth_is_of_view or (path / TRANSFORMS).is_file():
             calibration = calibration.with_depth_of_size(*depth_size_of_most(paired.entries))
         truth, unread = cls.truth(path, paired)
-        left_out = paired.left_out + others + unread + unread_truth(path, truth, cls.ESTIMATES)
-        sequence = cls(root.name, paired.entries, calibration, truth, reading, left_out)
         is_open = paired.seconds is not None and not reading.rate and told is None
+        unread += unread_truth(path, truth, cls.ESTIMATES) + (_unread_times(path) if is_open else [])
+        sequence = cls(root.name, paired.entries, calibration, truth, reading, paired.left_out + others + unread)
         counted = NUMBERS if film is None else BY_FILM
         sequence.times_guessed = counted if is_open else paired.guessed
         return sequence
@@ -144,6 +148,15 @@ class Open3DFolder(PlainFolder):
     def _intrinsics(cls, path: Path) -> Path | None:
         names = ("camera_intrinsic.json", "camera_intrinsics.json", "intrinsic.json")
         return next((path / name for name in names if (path / name).is_file()), None)
+
+
+def _unread_times(path: Path) -> list[str]:
+    """List files of the frames' times, one line each; they are not read, as their units and order are open."""
+    return [
+        f"{name}: times are not read from it: name the images by them, or say --rate"
+        for name in TIMES
+        if (path / name).is_file()
+    ]
 
 
 def by_rate(rate: Any) -> Seconds | None:
