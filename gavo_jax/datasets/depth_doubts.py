@@ -99,8 +99,8 @@ def _mean_step(images: Sequence[UInt16[np.ndarray, "h w"]]) -> float:
 
 
 def doubt_of_depth(sequence: FrameSequence) -> str | None:
-    """Describe what is unusual in the depth of a sequence, besides a `fault_of_scale`; None if nothing is."""
-    of_scale = None if fault_of_scale(sequence) else doubt_of_scale(sequence)
+    """Describe what is unusual in the depth of a sequence, besides a `fault_of_depth`; None if nothing is."""
+    of_scale = None if fault_of_depth(sequence) else doubt_of_scale(sequence)
     doubts = (of_scale, _limit(sequence), _inverse(sequence))
     return "; ".join(filter(None, doubts)) or None
 
