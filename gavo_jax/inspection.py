@@ -9,7 +9,8 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.datasets.depth_unit import doubt_of_scale, fault_of_scale, name_of_unit
+from gavo_jax.datasets.depth_doubts import doubt_of_depth, fault_of_depth
+from gavo_jax.datasets.depth_unit import name_of_unit
 from gavo_jax.depth_edges import DepthEdges
 from gavo_jax.frame_checks import MAX_INTERVAL_RATIO, History, Use, check_frame, some_of
 from gavo_jax.status import AlignmentStatus
@@ -74,7 +75,7 @@ def inspect_sequence(sequence: Sequence, on_frame: Callable[[], None] = lambda: 
         **_times(stamps),
         "delay_of_depth_ms": looked["delay"],
         "image": looked["image"],
-        "depth": looked["depth"] | {"fault": fault_of_scale(sequence), "doubt": doubt_of_scale(sequence)},
+        "depth": looked["depth"] | {"fault": fault_of_depth(sequence), "doubt": doubt_of_depth(sequence)},
         "camera": _camera(sequence.camera),
         "recorded_camera": _recorded(sequence),
         "ground_truth": _truth(sequence, stamps),

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import DISTORTION_COUNTS, MAX_SIDE, MIN_SIDE, PRESETS, Camera
+from gavo_jax.camera_files.foreign import hint_of_ending
 from gavo_jax.camera_files.makes import PARSERS, PROJECTION, Table
 from gavo_jax.camera_files.words import CAMERA_KEYS, DEVICE_KEYS, MODELS, REQUIRED, model_of
 from gavo_jax.errors import GavoError, as_path, read_text, shown
@@ -143,9 +144,10 @@ def load_calibration(
     suffix = path.suffix.lower()
     if suffix not in PARSERS:
         *suffixes, last = PARSERS
-        raise GavoError(
-            f"unknown camera {name!r}: neither one of {', '.join(PRESETS)} nor a file ({', '.join(suffixes)} or {last})"
-        )
+        endings = f"{', '.join(suffixes)} or {last}"
+        if path.is_file():
+            raise GavoError(f"{path}: a camera file ends in {endings}{hint_of_ending(path)}")
+        raise GavoError(f"unknown camera {name!r}: neither one of {', '.join(PRESETS)} nor a file ({endings})")
     most = MAX_JSON_BYTES if suffix == ".json" else MAX_CAMERA_FILE_BYTES
     table, origin = PARSERS[suffix](path, read_text(path, most)), str(path)
     projection = table.pop(PROJECTION, None)
@@ -198,6 +200,8 @@ def camera_from_table(path: Path | str, values: Table, depth_scale: float, part:
 
     def whole(key: str) -> int:
         value = values[key]
+        if isinstance(value, float) and value.is_integer():
+            value = int(value)
         if isinstance(value, bool) or not isinstance(value, int) or not MIN_SIDE <= value <= MAX_SIDE:
             fault = f"must be a whole number from {MIN_SIDE} to {MAX_SIDE}, not {shown(value)}"
             raise GavoError(f"{path}: {part}{key}: {fault}")

@@ -146,7 +146,11 @@ def read_nerfstudio(path: Path, values: Table) -> Table:
     """Looks like NeRF's transforms."""
     if cameras := _nerf_cameras(values):
         values = {**values, **common_camera(str(path), cameras)}
-    size = {ours: _whole(values[theirs]) for ours, theirs in (("width", "w"), ("height", "h")) if theirs in values}
+    size = {ours: values[theirs] for ours, theirs in (("width", "w"), ("height", "h")) if theirs in values}
+    if "fl_x" not in values and "camera_angle_x" in values:
+        raise GavoError(
+            f"{path}: an angle of view alone: write fl_x = w / (2 tan(camera_angle_x / 2)), cx, cy, w and h"
+        )
     table = {"fx": values["fl_x"], "fy": values.get("fl_y", values["fl_x"]), "cx": values["cx"], "cy": values["cy"]}
     table |= next(({"depth_scale": 1 / values[key]} for key in NERF_UNITS if values.get(key)), {})
     model = values.get("camera_model", "OPENCV")
@@ -192,8 +196,3 @@ def read_openloris(path: Path, values: Table) -> Table:
     if abs(fx - fy) > MAX_FOCAL_DIFFERENCE * fx:
         raise GavoError(f"{path}: {OPENLORIS_COLOR}: {fx:g} {cx:g} {fy:g} {cy:g}: hardly fx cx fy cy, in that order")
     return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **rest_of_camera(str(path), camera)}
-
-
-def _whole(value: Any) -> Any:
-    """Convert a size written as 640.0 to an integer."""
-    return int(value) if isinstance(value, float) and value.is_integer() else value

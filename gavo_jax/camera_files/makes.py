@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gavo_jax.camera_files.colmap import read_colmap
 from gavo_jax.camera_files.exports import (
     Table,
     is_nerfstudio,
@@ -20,6 +21,7 @@ from gavo_jax.camera_files.exports import (
     read_openloris,
     read_realsense,
 )
+from gavo_jax.camera_files.foreign import hint_of_text, refuse_bop_camera, refuse_foreign
 from gavo_jax.camera_files.storage import read_storage, real_of, values_of
 from gavo_jax.camera_files.words import (
     CAMERA_KEYS,
@@ -90,7 +92,9 @@ def _parse_json(path: Path, text: str) -> Table:
 
 
 def _of_known_make(path: Path, values: Any) -> Table:
-    """Convert a table of any known make to our keys; others stay as they are."""
+    """Convert a table of any known make, or the rows of a matrix, to our keys; others stay as they are."""
+    if isinstance(values, list) and len(values) == 3:
+        values = {"camera_matrix": values}
     if not isinstance(values, dict) or not values:
         raise GavoError(f"{path}: not a camera file: no `key: value` in it")
     if not all(isinstance(key, str) for key in values):
@@ -107,6 +111,7 @@ def _of_known_make(path: Path, values: Any) -> Table:
                 raise GavoError(
                     f"{path}: {read.__doc__ or ''} Entries are missing, or an entry is of another kind"
                 ) from None
+    refuse_foreign(path, values)
     return values
 
 
@@ -190,7 +195,9 @@ def _read_vins(path: Path, values: Table) -> Table:
 
 def _read_flat(path: Path, values: Table) -> Table:
     """Looks like a camera of single numbers."""
-    ours = {key: value for key, value in values.items() if key in CAMERA_KEYS + DEVICE_KEYS or not known(key)}
+    refuse_bop_camera(path, values)
+    kept = {*CAMERA_KEYS, *DEVICE_KEYS} - {"depth_scale"}
+    ours = {key: value for key, value in values.items() if key in kept or not known(key)}
     others = {key: value for key, value in values.items() if key not in ours}
     return {**ours, **rest_of_camera(str(path), others)}
 
@@ -246,7 +253,7 @@ def _parse_storage(path: Path, text: str) -> Table:
 def _storage_table(path: Path, storage: Any) -> Table:
     """What a FileStorage holds, read as YAML or JSON of the same names would be."""
     values = values_of(storage)
-    if not (_is_ros(values) or _is_vins(values) or is_openloris(values)):
+    if not (_is_ros(values) or _is_vins(values) or is_openloris(values) or _is_flat(values)):
         raise GavoError(f"{path}: camera_matrix: missing, or not 3x3")
     return _of_known_make(path, values)
 
@@ -309,10 +316,16 @@ def _parse_sens(path: Path, text: str) -> Table:
 
 
 def _parse_numbers(path: Path, text: str) -> Table:
-    """A matrix of 3×3 or 4×4, or one row `fx fy cx cy [distortion]` or `width height fx fy cx cy`; `#` comments."""
+    """A matrix of 3×3 or 4×4, or one row `fx fy cx cy [distortion]` or `width height fx fy cx cy`; `#` comments.
+
+    Rows end with a line, or with a semicolon as in MATLAB. COLMAP's cameras.txt is read, too.
+    """
     if "m_calibrationColorIntrinsic" in text:
         return _parse_sens(path, text)
-    lines = [re.split(r"[\s,]+", line.split("#")[0].strip(" \t[],")) for line in text.splitlines()]
+    if (camera := read_colmap(path, text)) is not None:
+        return camera
+    whole = (part for line in text.splitlines() for part in line.split("#")[0].split(";"))
+    lines = [re.split(r"[\s,]+", line.strip(" \t[],")) for line in whole]
     try:
         rows = [[number(field) for field in line] for line in lines if line != [""]]
         if len(rows) == 1 and len(rows[0]) == 9 and not any(rows[0][at] for at in (1, 3, 6, 7)):
@@ -330,10 +343,7 @@ def _parse_numbers(path: Path, text: str) -> Table:
     except GavoError:
         raise
     except ValueError:
-        named = re.search(r"^\s*fx\s*([:=])", text, re.MULTILINE)
-        hint = f": with names, call it {'.yaml' if named[1] == ':' else '.toml'}" if named else ""
-        if re.search(r"^\s*\d+ (\w+_)?(PINHOLE|RADIAL|OPENCV|FISHEYE|FOV) \d", text, re.MULTILINE):
-            hint = ": of a line of COLMAP's write these four, cx and cy less by half a pixel"
+        hint = hint_of_text(text)
         raise GavoError(f"{path}: neither a matrix of 3x3 or 4x4 nor a row of fx fy cx cy{hint}") from None
     return of_matrix(str(path), matrix[:3, :3].ravel().tolist())
 

@@ -14,16 +14,10 @@ from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.cli.options import Align
 from gavo_jax.cli.readiness import be_ready
 from gavo_jax.cli.selection import check_positive, choose_settings
-from gavo_jax.datasets.depth_unit import fault_of_scale, lack_of_depth
-from gavo_jax.datasets.files import (
-    Entry,
-    FileSequence,
-    Reading,
-    open_pair,
-    own_camera_file,
-    preset_by_name,
-    size_of_most,
-)
+from gavo_jax.datasets.depth_doubts import fault_of_depth
+from gavo_jax.datasets.depth_unit import lack_of_depth
+from gavo_jax.datasets.files import Entry, FileSequence, Reading, open_pair, size_of_most
+from gavo_jax.datasets.own_camera import own_camera_file, preset_by_name
 from gavo_jax.datasets.registry import open_source, source_around
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import rotation_angle
@@ -52,7 +46,7 @@ def align(options: Align) -> int:
     if not options.force:
         faults = [
             (options.depth0, lack_of_depth(pair)),
-            *((images[k][1], fault_of_scale(pair[k : k + 1])) for k in (0, 1)),
+            *((images[k][1], fault_of_depth(pair[k : k + 1])) for k in (0, 1)),
         ]
         for depth, fault in faults:
             if fault:

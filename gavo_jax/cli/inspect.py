@@ -48,8 +48,8 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     lines += [("depth", _depth(facts))]
     if fault := facts["depth"]["fault"]:
         lines.append(("depth scale", f"WRONG? {fault}"))
-    elif doubt := facts["depth"]["doubt"]:
-        lines.append(("depth scale", doubt))
+    if doubt := facts["depth"]["doubt"]:
+        lines.append(("depth in doubt", doubt))
     if fault := facts["depth"]["lies"]:
         lines.append(("depth image", f"WRONG? {fault} beside the colour image, by the edges of both"))
     if (delay := facts["delay_of_depth_ms"]) is not None:

@@ -147,12 +147,31 @@ def fault_of_scale(sequence: FrameSequence) -> str | None:
     calibration = getattr(sequence, "calibration", None)
     is_kinect = getattr(calibration, "preset", None) in KINECTS
     better = None if sample is None else better_scale(sample, scale, sequence.camera, is_kinect)
-    if sample is None or better is None:
+    if sample is None:
         return None
-    return (
-        f"depth with depth_scale {scale:g} has a median of {sample.median / scale:.3g} m: it looks like "
-        f"{name_of_unit(better)}: set --depth-scale {better:g}"
-    )
+    if better is not None:
+        return (
+            f"depth with depth_scale {scale:g} has a median of {sample.median / scale:.3g} m: it looks like "
+            f"{name_of_unit(better)}: set --depth-scale {better:g}"
+        )
+    median, in_other = sample.median / scale, _in_another_unit(sample, scale)
+    is_guess = sample.is_whole and getattr(sequence, "unit_is_assumed", False)
+    if is_guess and (median > DEPTH_RANGE[1] or median < DEPTH_RANGE[0] and in_other):
+        return (
+            f"depth in {name_of_unit(scale)}, a guess, has a median of {median:.3g} m: set --depth-scale, units per "
+            f"metre{in_other}{_as_halves(sample)}"
+        )
+    return None
+
+
+def _in_another_unit(sample: DepthSample, scale: float) -> str:
+    """What the median depth is in another unit that makes it usual; empty if none does."""
+    others = [unit for unit in COMMON if unit != scale and sample.median / unit < USUAL[1]]
+    other = _most_usual(sample, others)
+    if other is None:
+        return ""
+    named = f"{name_of_unit(other)} (--depth-scale {other:g})"
+    return f"; in {named} it is {sample.median / other:.3g} m"
 
 
 def doubt_of_scale(sequence: FrameSequence) -> str | None:
@@ -160,15 +179,9 @@ def doubt_of_scale(sequence: FrameSequence) -> str | None:
     sample, scale = sample_sequence(sequence)
     if sample is None or DEPTH_RANGE[0] < sample.median / scale < DEPTH_RANGE[1]:
         return None
-    others = [unit for unit in COMMON if unit != scale and sample.median / unit < USUAL[1]]
-    other = _most_usual(sample, others)
-    as_bits = _as_halves(sample) or _as_shares(sample, scale)
-    if other is None and not as_bits:
+    in_other, as_bits = _in_another_unit(sample, scale), _as_halves(sample) or _as_shares(sample, scale)
+    if not in_other and not as_bits:
         return None
-    in_other = ""
-    if other is not None:
-        named = f"{name_of_unit(other)} (--depth-scale {other:g})"
-        in_other = f"; in {named} it is {sample.median / other:.3g} m"
     return f"a median of {sample.median / scale:.3g} m is unusual{in_other}{as_bits}"
 
 
@@ -189,7 +202,7 @@ def _as_shares(sample: DepthSample, scale: float) -> str:
 
 def lack_of_depth(sequence: FrameSequence) -> str | None:
     """Describe why a sequence has no depth; None if any of its first, middle and last frames has a reading."""
-    read = _reader_of(sequence)
+    read = reader_of(sequence)
     places = sorted({*range(min(SAMPLED_FRAMES, len(sequence))), len(sequence) // 2, len(sequence) - 1})
     looked = recorded = 0
     for index in places:
@@ -210,22 +223,32 @@ def lack_of_depth(sequence: FrameSequence) -> str | None:
     return f"no reading in the depth of the {looked} frames that were looked at: 0, 65535, negative and NaN are none"
 
 
-def _reader_of(sequence: FrameSequence) -> Callable[[int], np.ndarray]:
+def reader_of(sequence: FrameSequence) -> Callable[[int], np.ndarray]:
     """A function from a frame's index to its depth, as stored where the sequence gives that."""
     return getattr(sequence, "raw_depth", None) or (lambda index: sequence[index].depth)
 
 
-def sample_sequence(sequence: FrameSequence) -> tuple[DepthSample | None, float]:
-    """Statistics of the first frames' depth, as stored where the sequence gives that, and its units per metre."""
-    read = _reader_of(sequence)
-    unit = getattr(sequence, "depth_unit", None)
+def first_depths(sequence: FrameSequence) -> list[np.ndarray]:
+    """The first frames' depth as stored, where the sequence gives that, without frames that cannot be read."""
+    read = reader_of(sequence)
     images = []
     for index in range(min(SAMPLED_FRAMES, len(sequence))):
         try:
             images.append(read(index))
         except FrameError:
             continue
-    return sample_depth(images), sequence.camera.depth_scale if unit is None else unit.file
+    return images
+
+
+def unit_of_file(sequence: FrameSequence) -> float:
+    """Units per metre of what `reader_of` reads."""
+    unit = getattr(sequence, "depth_unit", None)
+    return sequence.camera.depth_scale if unit is None else unit.file
+
+
+def sample_sequence(sequence: FrameSequence) -> tuple[DepthSample | None, float]:
+    """Statistics of the first frames' depth, as stored where the sequence gives that, and its units per metre."""
+    return sample_depth(first_depths(sequence)), unit_of_file(sequence)
 
 
 NAMES = {

@@ -1,27 +1,25 @@
 """Sequences of image files."""
 
 import os
-import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, overload
+from typing import ClassVar, NamedTuple, overload
 
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.camera import Camera, preset_for_sequence
-from gavo_jax.camera_files.calibration import DEPTH_SCALE, MAX_JSON_BYTES, Calibration, Size, load_calibration
+from gavo_jax.camera import Camera
+from gavo_jax.camera_files.calibration import DEPTH_SCALE, Calibration, Size, load_calibration
 from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler, common_white, float_unit
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.datasets.depth_unit import better_scale, sample_depth
 from gavo_jax.datasets.films import file_of, film_of, read_frame
-from gavo_jax.datasets.images import read_bytes, read_color, read_depth
-from gavo_jax.datasets.truth import icl_truth
-from gavo_jax.errors import GavoError, as_number, read_json_object, read_text
+from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_color, read_depth
+from gavo_jax.errors import GavoError, as_number
 from gavo_jax.image.numbers import Depth
 from gavo_jax.trajectory import Trajectory
 
@@ -246,88 +244,8 @@ class FileSequence:
         for entry in self.entries:
             for path in (entry.color, entry.depth):
                 if path is not None and not os.path.isfile(file_of(path)):
-                    raise GavoError(f"{path}: {_instead(path)}: restore it, or leave its frame out")
+                    raise GavoError(f"{path}: {_instead(path)}")
         self[0]
-
-
-CAMERA_FILES = (
-    *(f"{name}{ending}" for name in ("camera", "calibration", "camera_info") for ending in (".toml", ".yaml", ".yml")),
-    *("camera_intrinsic.json", "camera_intrinsics.json", "camera.json", "cam_params.json", "camera.xml"),
-    *("camera-intrinsics.txt", "camera_intrinsics.txt", "camera_intrinsic.txt", "intrinsics.txt", "calibration.txt"),
-    *("intrinsics_color.txt", "intrinsic_color.txt", "intrinsic/intrinsic_color.txt", "colorIntrinsics.txt"),
-)
-"""Names by which a camera file in a folder, or in its parent, is recognised."""
-
-SCANS, OF_A_SCAN = ("info.txt", "_info.txt"), b"m_calibrationColorIntrinsic"
-"""Names of a scan's info file, and a key that it contains: other programs use the same names."""
-
-EXPORTED_CAMERA_FILES = (
-    *(f"intrinsics{ending}" for ending in (".toml", ".yaml", ".yml", ".json")),
-    *("calibration.json", "camera_matrix.csv", "transforms.json", "metadata.json"),
-)
-"""Names of camera files exported by other programs, which may be estimates: used only if there is no other camera."""
-
-
-def told_in(file: Path) -> dict[str, Any]:
-    """The JSON object in a file beside the images; empty if it cannot be read as one."""
-    try:
-        return read_json_object(file, MAX_JSON_BYTES)
-    except GavoError:
-        return {}
-
-
-def own_camera_file(folder: Path) -> Path | None:
-    """The camera file in a folder; None if there is none.
-
-    Raises:
-        GavoError: it is that of colour, and the depth camera's file beside it differs.
-    """
-    file = next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
-    if file is None:
-        return info_of_scan(folder)
-    other = file.with_name(re.sub("(_|^)color", r"\1depth", file.name))
-    if other.is_file() and read_text(other).split() != read_text(file).split():
-        raise GavoError(
-            f"{file}: {other.name} beside it is of another camera: say --camera with a file of both cameras "
-            "([depth], colour_T_depth), or of one if depth is registered to colour"
-        )
-    return file
-
-
-def info_of_scan(folder: Path) -> Path | None:
-    """The info file of a scan, with both cameras, in a folder; None if there is none."""
-    files = (folder / name for name in SCANS)
-    return next((file for file in files if file.is_file() and OF_A_SCAN in read_bytes(file)), None)
-
-
-def preset_or_export(folder: Path, load: Callable[[Path], Calibration]) -> Calibration:
-    """The preset that a folder's name implies, else a camera file exported to it by another program.
-
-    Raises:
-        GavoError: there is neither, or the file cannot be read.
-    """
-    try:
-        return preset_by_name(folder)
-    except GavoError:
-        files = (folder / name for name in EXPORTED_CAMERA_FILES if (folder / name).is_file())
-        file = next((file for file in files if file.stem != "metadata" or "K" in told_in(file)), None)
-        if file is None:
-            raise
-    return load(file)
-
-
-def preset_by_name(folder: Path) -> Calibration:
-    """The preset implied by a folder's name, or by a trajectory of ICL-NUIM in it.
-
-    Raises:
-        GavoError: no preset is implied; the message says what would help.
-    """
-    try:
-        return load_calibration(preset_for_sequence(folder.resolve().name))
-    except GavoError as error:
-        if icl_truth(folder) is not None:
-            return load_calibration("icl")
-        raise GavoError(f"{folder}: no camera file in it, and {error}") from None
 
 
 def size_of_most(entries: Sequence[Entry]) -> Size:
@@ -371,10 +289,17 @@ def places_of_a_few(count: int) -> list[int]:
 
 
 def _instead(path: Path) -> str:
-    """Describe what is at the path of an image that is not a file."""
+    """Describe what is at the path of an image that is not a file, and what helps."""
+    endings = {*COLOR_SUFFIXES, *DEPTH_SUFFIXES}
+    stem = path.stem if path.suffix.lower() in endings else path.name
+    other = next((name for ending in sorted(endings) if os.path.isfile(path.parent / (name := stem + ending))), None)
     if os.path.islink(path):  # False, without raising, for a name that is too long
-        return f"a link to {os.readlink(path)[:200]}, which is missing"
-    return "not a file" if os.path.exists(path) else "image is missing"
+        there = f"a link to {os.readlink(path)[:200]}, which is missing"
+    elif other is not None:
+        return f"image is missing, but {other[:200]} is there: correct the list, or leave its frame out"
+    else:
+        there = "not a file" if os.path.exists(path) else "image is missing"
+    return f"{there}: restore it, or leave its frame out"
 
 
 def resolve_folder(folder: Path) -> Path:

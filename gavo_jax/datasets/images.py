@@ -20,7 +20,7 @@ from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.quiet import without_lines, without_log, without_words_on
 from gavo_jax.image.numbers import NO_READING, Depth
 
-COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2")
+COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2", ".avif")
 """Suffixes of colour images searched for in a folder; a file that is given by name may have any."""
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr", ".npy", ".npz", ".pgm", ".pfm")
 
@@ -106,6 +106,8 @@ def decode_depth(data: bytes, name: str) -> Depth:
         image = image[..., 0]
     elif image.ndim == 3 and image.shape[0] == 1:  # channel first, as in PyTorch
         image = image[0]
+    elif image.shape[2:] in ((3,), (4,)) and image.dtype.itemsize > 1 and _is_grey(image):
+        image = image[..., 0]
     if image.ndim != 2 or image.dtype.itemsize < 2 or image.dtype.kind not in "uif":
         found = _describe(image)
         if image.dtype == np.uint8:
@@ -128,6 +130,12 @@ def _unpacked(image: np.ndarray) -> np.ndarray:
     if image.dtype != np.uint8 or image.shape[2:] != (4,) or not 0 < image[..., 3].max() < SIGN:
         return image
     return np.ascontiguousarray(image).view("<f4")[..., 0]
+
+
+def _is_grey(image: Shaped[np.ndarray, "h w channels"]) -> bool:
+    """Whether the three channels of colour are equal, as where Blender writes depth; a fourth is transparency."""
+    is_float = image.dtype.kind == "f"
+    return all(np.array_equal(image[..., 0], image[..., i], equal_nan=is_float) for i in (1, 2))
 
 
 def to_float32(image: np.ndarray) -> Float[np.ndarray, "h w"]:
@@ -180,7 +188,10 @@ def _decode(data: bytes, name: str, flags: int) -> np.ndarray:
     if data.startswith(PNG_SIGNATURE):
         _check_png(data, name)
     elif not _is_known(data):
-        raise FrameError(f"{name}: no image that OpenCV decodes (begins with {data[:8]!r}): convert it to PNG")
+        other = next((words for begin, words in IN_PLACE if data.lstrip().lower().startswith(begin)), None)
+        raise FrameError(
+            f"{name}: {other or f'no image that OpenCV decodes (begins with {data[:8]!r}): convert it to PNG'}"
+        )
     data = PFM_SCALE.sub(rb"\g<1>1", data, 1) if data.startswith((b"Pf", b"PF")) else _unturned(data, name)
     image = _decoded(data, flags, name)
     if image is None and flags == AS_COLOR:
@@ -250,6 +261,16 @@ SIGNATURES = (
     *(b"P" + kind for kind in (b"1", b"2", b"3", b"4", b"5", b"6", b"7", b"f", b"F")),
 )
 """First bytes of the formats that OpenCV decodes."""
+
+
+WEB_PAGE = "a web page in place of an image: get the file anew"
+
+IN_PLACE = (
+    (b"version https://git-lfs", "a pointer of Git LFS in place of the image: fetch that (git lfs pull)"),
+    (b"<!doctype", WEB_PAGE),
+    (b"<html", WEB_PAGE),
+)
+"""First bytes, in small letters, of what servers give in place of images, and what helps."""
 
 
 def _is_known(data: bytes) -> bool:
@@ -345,7 +366,7 @@ def _depth_channel(channels: Mapping[str, Any], name: str) -> np.ndarray:
         found = ", ".join(chosen)[:100] or "none"
         raise FrameError(f"{name}: of the channels of this OpenEXR image one has to be depth, named Z: found {found}")
     pixels = np.asarray(channels[chosen[0]].pixels)
-    if pixels.ndim == 3 and not all(np.array_equal(pixels[..., 0], pixels[..., i], True) for i in (1, 2)):
+    if pixels.ndim == 3 and not _is_grey(pixels):
         raise FrameError(f"{name}: an OpenEXR image of colour ({chosen[0]}), and no channel of depth, named Z")
     return pixels[..., 0] if pixels.ndim == 3 else pixels
 

@@ -15,9 +15,10 @@ from gavo_jax.datasets.layouts.bonn import Bonn
 from gavo_jax.datasets.layouts.bop import BopScene
 from gavo_jax.datasets.layouts.nerfstudio import Nerfstudio
 from gavo_jax.datasets.layouts.neural import NeuralRgbd, SemanticReplica
-from gavo_jax.datasets.layouts.numbered import Open3DFolder, PlainFolder, Replica, ScanNet, SevenScenes
+from gavo_jax.datasets.layouts.numbered import Replica, ScanNet, SevenScenes
 from gavo_jax.datasets.layouts.openloris import OpenLoris
 from gavo_jax.datasets.layouts.phones import ArkitScenes, Record3D, StrayScan
+from gavo_jax.datasets.layouts.plain_folder import Open3DFolder, PlainFolder
 from gavo_jax.datasets.layouts.rtabmap import RtabMap
 from gavo_jax.datasets.layouts.tartanair import TartanAir
 from gavo_jax.datasets.layouts.tum import TumSequence

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 from gavo_jax.camera_files.calibration import load_camera
 from gavo_jax.datasets.base import Sequence
-from gavo_jax.datasets.depth_unit import fault_of_scale, lack_of_depth
+from gavo_jax.datasets.depth_doubts import fault_of_depth
+from gavo_jax.datasets.depth_unit import lack_of_depth
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
@@ -55,7 +56,7 @@ def open_part(
             f"at least 2 are needed{left_out}"
         )
     chosen.check()
-    if source != SYNTHETIC and not force and (fault := lack_of_depth(chosen) or fault_of_scale(chosen)):
+    if source != SYNTHETIC and not force and (fault := lack_of_depth(chosen) or fault_of_depth(chosen)):
         raise GavoError(f"{source}: {fault}, or go on with --force")
     return chosen
 

@@ -2,12 +2,15 @@
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 from gavo_jax.datasets.films import FILMS
+from gavo_jax.datasets.known_datasets import ARRAYS, AS_DEPTH, RECORD_3D, words_of_known
 from gavo_jax.datasets.layouts.image_folders import (
+    ALL_SUFFIXES,
     COLOR_FOLDERS,
     DEPTH_FOLDERS,
     missing_folder,
@@ -38,12 +41,10 @@ RECORDINGS = {
     ".svo": "a recording of a ZED: write its images and depth with the ZED SDK's export samples",
     ".svo2": "a recording of a ZED: write its images and depth with the ZED SDK's export samples",
     ".oni": "a recording of OpenNI: write its images and depth with OpenNI's tools",
-    ".r3d": "a recording of Record3D: export it in the app as EXR + RGB, and name the folder of rgb/ and depth/",
+    ".r3d": RECORD_3D,
     ".klg": "a log of ElasticFusion's logger: write its images and depth first",
 }
 """Suffixes of proprietary recordings, and how to convert each."""
-
-ARRAYS = "write its colour and depth as images into rgb/ and depth/, or as .npy of one frame each"
 
 PACKED_ARRAYS = {
     **dict.fromkeys((".hdf5", ".h5"), f"arrays in HDF5: {ARRAYS} (h5py)"),
@@ -65,8 +66,8 @@ DEPTH_IN_NAME = re.compile(r"(?<![a-z])depth", re.IGNORECASE)
 WHAT_OF = re.compile(r"^(?:drive|export|recording|scan|scene) of ")
 """Beginnings of the names of kinds that are left out of lists."""
 
-LOOKED_INTO = 200
-"""Folders two levels down that are looked into."""
+LOOKED_INTO, DEEPEST = 200, 4
+"""Most folders further down that are looked into, and how far down."""
 
 SHOWN = 5
 """Number of names that a message lists."""
@@ -148,39 +149,17 @@ def _stereo(place: Place) -> str | None:
     if (stereo / "depth0" / "data").is_dir():
         return (
             f"{stereo / 'depth0'}: link its images as depth/, beside rgb/; InteriorNet's, which are lengths of rays, "
-            "have to be written there as z = length / sqrt(1 + x^2 + y^2)"
+            f"have to be written there {AS_DEPTH}"
         )
     return f"{stereo / 'cam0'}: a recording as EuRoC has it, of stereo images without depth, which this needs"
 
 
-def _nyu(place: Place) -> str | None:
-    if not (any(place.path.glob("d-*.pgm")) and any(place.path.glob("r-*.ppm"))):
-        return None
-    return (
-        "the raw recording of NYU Depth, whose depth is in units of disparity: write rgb/ and depth/ with the "
-        "dataset's toolbox first"
-    )
-
-
-def _spectacular(place: Place) -> str | None:
-    if not all((place.path / name).is_file() for name in ("data.jsonl", "calibration.json")):
-        return None
-    return (
-        "a recording of Spectacular AI: write its images with sai-cli process, and name the folder of transforms.json"
-    )
-
-
-def _scannet_plus_plus(place: Place) -> str | None:
-    if not all((place.path / name).is_file() for name in ("depth.bin", "pose_intrinsic_imu.json")):
-        return None
-    return (
-        "the iPhone's part of a scan of ScanNet++, its images still packed: write rgb/ and depth/ with "
-        "iphone/prepare_iphone_data.py of its toolbox (extract_rgb, extract_depth)"
-    )
+def _known(place: Place) -> str | None:
+    return words_of_known(place.path)
 
 
 def _rays(place: Place) -> str | None:
-    rays = "have to be written into depth/, beside rgb/, as z = length / sqrt(1 + x^2 + y^2)"
+    rays = f"have to be written into depth/, beside rgb/, {AS_DEPTH}"
     names = {child.name for child in place.inside}
     if {"photo", "depth", "instance"} <= names:
         return f"depth/: SceneNet RGB-D's are lengths of rays, which {rays}; link photo/ as rgb/"
@@ -189,29 +168,10 @@ def _rays(place: Place) -> str | None:
     return f"{found[:60]}: Replicator's lengths of rays: write distance_to_image_plane there, or they {rays}"
 
 
-def _mid_air(place: Place) -> str | None:
-    if not any((place.path / "color_left").glob("trajectory_*")):
-        return None
-    return (
-        "recordings of Mid-Air, whose PNG hold floats of 16 bits: of a trajectory write depth = 512 / disparity of "
-        "stereo_disparity/ as TIFF or .npy of floats into depth/, beside rgb/ with the images of color_left/"
-    )
-
-
 def _recording(place: Place) -> str | None:
     known = (*FILMS, *RECORDINGS, *PACKED)
     found = next((child for child in place.inside if child.is_file() and child.suffix.lower() in known), None)
     return None if found is None else f"{found.name[:60]}: {_in_file(found)}"
-
-
-def _record_3d(place: Place) -> str | None:
-    is_unzipped = (place.path / "rgbd").is_dir() and (place.path / "metadata").is_file()
-    return f"unzipped, {RECORDINGS['.r3d']}" if is_unzipped else None
-
-
-def _le_robot(place: Place) -> str | None:
-    is_one = (place.path / "meta" / "info.json").is_file() and (place.path / "data").is_dir()
-    return f"a dataset of LeRobot, of films and tables: of one episode {ARRAYS}" if is_one else None
 
 
 def _part_of_source(place: Place) -> str | None:
@@ -220,21 +180,34 @@ def _part_of_source(place: Place) -> str | None:
 
 
 def _further_down(place: Place) -> str | None:
-    found = next((inner for inner in islice(_two_down(place), LOOKED_INTO) if place.is_source(inner)), None)
+    found = next((inner for inner in islice(_further(place), LOOKED_INTO) if place.is_source(inner)), None)
     return found and f"no source itself, but one lies further down: name {found.relative_to(place.path)}"
 
 
-def _two_down(place: Place) -> Iterator[Path]:
-    """The folders inside those inside, hidden ones left out."""
-    for child in filter(_is_open_folder, place.inside):
-        try:
-            yield from filter(_is_open_folder, sorted(child.iterdir()))
-        except OSError:  # nobody may look
-            continue
+def _further(place: Place) -> Iterator[Path]:
+    """The folders inside those inside, level by level, hidden ones left out."""
+    level = list(filter(_is_open_folder, place.inside))
+    for _ in range(2, DEEPEST + 1):
+        found: list[Path] = []
+        for folder in level[:LOOKED_INTO]:
+            with suppress(OSError):  # nobody may look
+                found += filter(_is_open_folder, sorted(folder.iterdir()))
+        yield from found
+        level = found
 
 
 def _is_open_folder(path: Path) -> bool:
     return path.is_dir() and not path.name.startswith(".")
+
+
+def _twins(place: Place) -> str | None:
+    """Advice on images of two kinds that differ in their endings alone."""
+    images = [child for child in place.inside if child.suffix.lower() in ALL_SUFFIXES and child.is_file()]
+    by_stem = {image.stem: image for image in reversed(images)}
+    twins = next(((by_stem[image.stem], image) for image in images if by_stem[image.stem] != image), None)
+    if twins is None:
+        return None
+    return f"{twins[0].name[:60]} beside {twins[1].name[:60]}: put what is depth into depth/, and colour into rgb/"
 
 
 def _folder(place: Place) -> str:
@@ -257,16 +230,12 @@ GUESSES: tuple[Callable[[Place], str | None], ...] = (
     _sources,
     _images_missing,
     _stereo,
-    _nyu,
-    _spectacular,
-    _scannet_plus_plus,
+    _known,
     _rays,
-    _mid_air,
-    _record_3d,
-    _le_robot,
     _recording,
     _part_of_source,
     _further_down,
+    _twins,
     _folder,
 )
 """Guesses about a folder, in the order in which they are tried; the last one always returns a message."""

@@ -412,7 +412,6 @@ FAULTS = {
         "fx: must be a number",
     ),
     "transforms of text.json": (json.dumps({"frames": [{**NERF, "fl_x": "long"}]}), "fx: must be a number"),
-    "transforms without.json": (json.dumps({"frames": [], "camera_angle_x": 0.7}), "Its entry 'fl_x' is missing"),
     "transforms of poses.json": (json.dumps({"frames": [{"file_path": "a"}] * 2}), "Its entry 'fl_x' is missing"),
     "transforms round.json": (json.dumps({**NERF, "camera_model": "EQUIRECTANGULAR"}), "'EQUIRECTANGULAR'"),
     "torn.json": ('{"width": 3', "not JSON"),
@@ -450,10 +449,6 @@ FAULTS = {
     "negative.toml": (TOML.replace("510", "-510"), "fy: negative (-510), as ICL-NUIM has it"),
     "negative.txt": ("481.2 -480.0 319.5 239.5\n", "fy: negative (-480.0), as ICL-NUIM has it"),
     "millimetres.toml": (TOML.replace("500", "3.6"), "fx: must be a number from 64 to 12800, not 3.6"),
-    "cameras.txt": (
-        "# CAMERA_ID, MODEL\n1 SIMPLE_PINHOLE 640 480 525 320 240\n",
-        "nor a row of fx fy cx cy: of a line of COLMAP's write",
-    ),
     "names.txt": ("fx: 500\nfy: 510\n", "nor a row of fx fy cx cy: with names, call it .yaml"),
     "toml.txt": (TOML, "nor a row of fx fy cx cy: with names, call it .toml"),
     "underscores.txt": ("5_00 510 319.5 239.5\n", "neither a matrix"),

@@ -65,6 +65,29 @@ def made(folder: Path, *names: str) -> Path:
         ),
         (("d-1.pgm", "r-1.ppm"), "the raw recording of NYU Depth"),
         (("rgb/",), "a folder of rgb/, and "),
+        (("images/scene_cam_00_geometry_hdf5/frame.0000.depth_meters.hdf5",), "Hypersim, in HDF5: .* lengths of rays"),
+        (("scene_cam_00_final_hdf5/x.hdf5", "scene_cam_00_geometry_hdf5/x.hdf5"), "Hypersim, in HDF5"),
+        (
+            ("image_02/data/0.png", "proj_depth/groundtruth/image_02/0.png"),
+            "KITTI's depth completion: link image_02/data as rgb/ .* depth_scale = 256",
+        ),
+        (("image/0.png", "groundtruth_depth/0.png", "velodyne_raw/0.png"), "single images of KITTI's depth completion"),
+        (
+            tuple(f"{a}_{b}_images/0.png" for a in ("matterport", "undistorted") for b in ("color", "depth")),
+            "photographs of Matterport3D, which turns by 60 degrees",
+        ),
+        (("PV/1.bytes", "Depth Long Throw/1.pgm", "Depth Long Throw_lut.bin"), "HoloLens 2: .*pinhole_projection"),
+        (("PV.tar", "Depth AHaT.tar"), "HoloLens 2: .*pinhole_projection"),
+        (("data/color0.jpg", "data/depth0.dpt"), "LINEMOD as first published: take it as BOP has it"),
+        (("images/0.jpg", "stereo/depth_maps/0.jpg.geometric.bin"), "depth of COLMAP's stereo, whose unit is unknown"),
+        (("1.jpg", "1.png", "2.jpg", "2.png", "a.txt"), r"1\.jpg beside 1\.png: put what is depth into depth/, and"),
+        (("frame1.jpg", "frame1.npy"), r"frame1\.jpg beside frame1\.npy: put what is depth into depth/"),
+        (("rgb/walk.mp4", "depth/0.png"), r"no colour images in rgb \(walk\.mp4\): a film goes .*, as rgb\.mp4"),
+        (
+            ("rgb/0.png", "depth/0.jpg"),
+            r"no depth images in depth \(0\.jpg\): those are pictures of depth: write",
+        ),
+        (("rgb/0.png", "depth/0.bin"), r"no depth images in depth \(0\.bin\): those end in \.png, "),
         (("notes.md", "more.md"), "a folder of more.md, notes.md: not one of: "),
         (("a/", "b.md"), "colour is looked for in "),
         (tuple(f"{k}.md" for k in range(9)), r"a folder of 0\.md, 1\.md, 2\.md, 3\.md, 4\.md and 4 more"),
@@ -111,6 +134,13 @@ def test_a_source_further_down_is_named(tmp_path: Path) -> None:
     folder = made(tmp_path / "root", "notes.md", "kv1/.hidden/0.png", "kv1/sun/notes.md", "scenes/chess/rgb/0.png")
     made(folder, "scenes/chess/depth/0.png")
     with pytest.raises(GavoError, match="root: no source itself, but one lies further down: name scenes/chess$"):
+        open_source(folder)
+
+
+def test_a_source_four_folders_down_is_named(tmp_path: Path) -> None:
+    """As BlenderProc writes its scenes."""
+    folder = made(tmp_path / "output", *(f"bop_data/set/train_pbr/000000/{kind}/0.png" for kind in ("rgb", "depth")))
+    with pytest.raises(GavoError, match="one lies further down: name bop_data/set/train_pbr/000000$"):
         open_source(folder)
 
 

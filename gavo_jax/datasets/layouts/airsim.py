@@ -11,10 +11,11 @@ import numpy as np
 
 from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.datasets.assembly import METRES
-from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
+from gavo_jax.datasets.files import Entry, Reading, size_of_most
 from gavo_jax.datasets.images import read_depth
-from gavo_jax.datasets.layouts.numbered import PlainFolder
 from gavo_jax.datasets.layouts.pairing import Paired, paired_at
+from gavo_jax.datasets.layouts.plain_folder import PlainFolder
+from gavo_jax.datasets.own_camera import own_camera_file
 from gavo_jax.datasets.truth import Seconds
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.image.numbers import Depth

@@ -13,11 +13,13 @@ from gavo_jax.camera_files.exports import common_camera
 from gavo_jax.camera_files.words import REQUIRED
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.clocks import told_stamp
-from gavo_jax.datasets.files import Entry, Reading, Size, own_camera_file
+from gavo_jax.datasets.files import Entry, Reading, Size
 from gavo_jax.datasets.layouts.image_folders import plain_files
 from gavo_jax.datasets.layouts.nerf import FLIP, pose_of_rows
-from gavo_jax.datasets.layouts.numbered import NumberedFolder, PlainFolder, of_matrices
+from gavo_jax.datasets.layouts.numbered import NumberedFolder, of_matrices
 from gavo_jax.datasets.layouts.pairing import Paired
+from gavo_jax.datasets.layouts.plain_folder import PlainFolder
+from gavo_jax.datasets.own_camera import own_camera_file
 from gavo_jax.datasets.truth import by_stamp
 from gavo_jax.errors import GavoError, read_json_object, read_text
 from gavo_jax.trajectory import Trajectory

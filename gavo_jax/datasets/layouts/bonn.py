@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.camera import preset_for_sequence
-from gavo_jax.datasets.files import own_camera_file
 from gavo_jax.datasets.layouts.tum import TumSequence
+from gavo_jax.datasets.own_camera import own_camera_file
 from gavo_jax.datasets.truth import Seconds
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory

@@ -9,9 +9,10 @@ from jaxtyping import Float
 
 from gavo_jax.camera_files.calibration import MAX_JSON_BYTES, Calibration, load_calibration
 from gavo_jax.datasets.assembly import MILLIMETRES
-from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
+from gavo_jax.datasets.files import Entry, Reading, size_of_most
 from gavo_jax.datasets.layouts.image_folders import plain_files
 from gavo_jax.datasets.layouts.numbered import NumberedFolder, of_matrices
+from gavo_jax.datasets.own_camera import own_camera_file
 from gavo_jax.datasets.truth import pose_of
 from gavo_jax.errors import GavoError, read_json_object
 from gavo_jax.trajectory import inverse

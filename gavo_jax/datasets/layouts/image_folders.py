@@ -9,7 +9,7 @@ from gavo_jax.datasets.names import images_among, mask_numbers
 
 COLOR_FOLDERS = (
     *("color", "colour", "rgb", "image", "images", "image_left", "lowres_wide"),
-    *("color_images", "colour_images", "rgb_images", "rgb_raw", "color_raw", "gray"),
+    *("color_images", "colour_images", "rgb_images", "rgb_raw", "color_raw", "gray", "jpegimages"),
 )
 DEPTH_FOLDERS = (
     *("aligned_depth", "depth_registered", "depth", "depths", "depth_left", "lowres_depth"),
@@ -134,9 +134,23 @@ def missing_images(path: Path) -> str | None:
         return None
     for kind, folder, suffixes in (("colour", color, COLOR_SUFFIXES), ("depth", depth, DEPTH_SUFFIXES)):
         if not images_among(folder.glob("*"), (*suffixes, ".npy")):
-            inside = ", ".join(child.name[:60] for child in sorted(folder.glob("*"))[:2]) or "empty"
-            return f"no {kind} images in {folder.name} ({inside}): those end in {', '.join(suffixes)}"
+            inside = sorted(folder.glob("*"))
+            names = ", ".join(child.name[:60] for child in inside[:2]) or "empty"
+            hint = _instead_of_images(kind, folder.name, inside) or f"those end in {', '.join(suffixes)}"
+            return f"no {kind} images in {folder.name} ({names}): {hint}"
     return None
+
+
+def _instead_of_images(kind: str, folder: str, inside: list[Path]) -> str:
+    """Advice on what lies in a folder in place of images; empty if there is none."""
+    endings = {child.suffix.lower() for child in inside}
+    if inside and all(child.is_dir() for child in inside):
+        return f"where they lie in {inside[0].name[:60]}/, link that as {folder}/"
+    if kind == "colour" and len(inside) == 1 and endings & {*FILMS}:
+        return f"a film goes beside that folder, as rgb{inside[0].suffix}"
+    if kind == "depth" and endings & {".jpg", ".jpeg", ".webp"}:
+        return "those are pictures of depth: write depth itself, as PNG of 16 bits or TIFF of floats"
+    return ""
 
 
 def missing_folder(path: Path) -> str | None:

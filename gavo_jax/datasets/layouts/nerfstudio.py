@@ -11,8 +11,8 @@ from gavo_jax.datasets.clocks import in_seconds, told_stamp, told_unit
 from gavo_jax.datasets.files import Reading, resolve_folder
 from gavo_jax.datasets.images import COLOR_SUFFIXES
 from gavo_jax.datasets.layouts.nerf import TRANSFORMS
-from gavo_jax.datasets.layouts.numbered import PlainFolder
 from gavo_jax.datasets.layouts.pairing import Paired, paired_as_told, paired_at
+from gavo_jax.datasets.layouts.plain_folder import PlainFolder
 from gavo_jax.datasets.layouts.tum import path_below
 from gavo_jax.datasets.names import images_among
 from gavo_jax.datasets.truth import Seconds

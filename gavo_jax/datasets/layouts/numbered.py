@@ -1,4 +1,4 @@
-"""Datasets whose frames are numbered files in a folder: 7-Scenes, ScanNet, Replica, Open3D's, and plain folders.
+"""Datasets whose frames are numbered files in a folder: 7-Scenes, ScanNet and Replica.
 
 Each class defines how its folder is recognised, where its images and poses are, and which camera took them.
 """
@@ -18,36 +18,20 @@ from gavo_jax.camera_files.exports import common_camera
 from gavo_jax.camera_files.makes import of_matrix
 from gavo_jax.camera_files.words import REQUIRED
 from gavo_jax.datasets.assembly import MILLIMETRES
-from gavo_jax.datasets.files import (
-    Entry,
-    FileSequence,
-    Reading,
-    Size,
-    depth_size_of_most,
-    own_camera_file,
-    preset_or_export,
-    resolve_folder,
-    size_of_most,
-    told_in,
-)
-from gavo_jax.datasets.films import film_of, rate_of
+from gavo_jax.datasets.files import Entry, FileSequence, Reading, Size, depth_size_of_most, resolve_folder, size_of_most
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
-from gavo_jax.datasets.layouts.image_folders import passed_over, plain_files
-from gavo_jax.datasets.layouts.nerf import TRANSFORMS, read_transforms
-from gavo_jax.datasets.layouts.pairing import Paired, paired_by_number, paired_by_stamp
+from gavo_jax.datasets.layouts.image_folders import plain_files
 from gavo_jax.datasets.names import Found, by_number, images_among
-from gavo_jax.datasets.truth import TRUTH, Seconds, in_order, pose_files, pose_in, pose_of, truth_in, unread_truth
+from gavo_jax.datasets.own_camera import own_camera_file
+from gavo_jax.datasets.truth import TRUTH, in_order, pose_files, pose_in, pose_of, truth_in
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory, inverse
 
 RATE = 30.0
 """Default frame rate, Hz: that of nearly every RGB-D camera."""
 
-SLOWEST, FASTEST = 0.1, 1000.0
-"""Range of plausible frame rates, Hz."""
-
-NUMBERS, BY_FILM = "names are numbers", "as the film says"
-"""Values of `times_guessed` for stamps from frame numbers, at the default rate or at a film's."""
+NUMBERS = "names are numbers"
+"""Value of `times_guessed` for stamps from frame numbers at the default rate."""
 
 
 class NumberedFolder(FileSequence):
@@ -271,135 +255,6 @@ class Replica(NumberedFolder):
         file = path / "traj.txt"
         rows = in_order(file, cls.find(path).color) if file.exists() else ()
         return {number: pose for number, place, row in rows if (pose := pose_of(place, row)) is not None}
-
-
-class PlainFolder(FileSequence):
-    """A folder of colour and a folder of depth images, or one folder of both, distinguished by name.
-
-    Names that are stamps are paired by time (see `names.stamps`). Otherwise images of the same number form a frame, and
-    its time is that number over the rate.
-    """
-
-    kind: ClassVar[str] = "folder of colour and depth images"
-    scale_is_open: ClassVar[bool] = True
-    depth_is_of_view: ClassVar[bool] = False
-    """As in `NumberedFolder`; it is also assumed if there is a `transforms.json`."""
-    ESTIMATES: ClassVar[str] = ""
-    """Glob pattern of pose files estimated by the program that wrote the folder, which are no ground truth."""
-
-    @classmethod
-    def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by the names of its subfolders or files."""
-        color, depth = plain_files(path)
-        return bool(color and depth)
-
-    @classmethod
-    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """The camera file in the folder or its parent, else the preset implied by its name, else an exported camera.
-
-        Raises:
-            GavoError: there is none.
-        """
-        load = partial(load_calibration, size=partial(size_of_most, entries), depth_scale=MILLIMETRES)
-        file = own_camera_file(path) or own_camera_file(path.parent)
-        return preset_or_export(path, load) if file is None else load(file)
-
-    @classmethod
-    def open(cls, path: Path, reading: Reading) -> Self:
-        """Find the files, pair them and read the camera.
-
-        Raises:
-            GavoError: no frames, or no camera.
-        """
-        root = resolve_folder(path)
-        color, depth, others = cls.images(path)
-        film = film_of(color[0]) if color else None
-        told = None if reading.rate else cls.clock(path)
-        usual = reading.rate or (film and rate_of(film)) or RATE
-        paired = cls.pair(path, color, depth, reading, told or (lambda numbers: numbers / usual))
-        own = partial(cls.calibrate, path, paired.entries, reading)
-        calibration = reading.calibration(own, partial(size_of_most, paired.entries), MILLIMETRES)
-        if cls.depth_is_of_view or (path / TRANSFORMS).is_file():
-            calibration = calibration.with_depth_of_size(*depth_size_of_most(paired.entries))
-        truth, unread = cls.truth(path, paired)
-        left_out = paired.left_out + others + unread + unread_truth(path, truth, cls.ESTIMATES)
-        sequence = cls(root.name, paired.entries, calibration, truth, reading, left_out)
-        is_open = paired.seconds is not None and not reading.rate and told is None
-        counted = NUMBERS if film is None else BY_FILM
-        sequence.times_guessed = counted if is_open else paired.guessed
-        return sequence
-
-    @classmethod
-    def images(cls, path: Path) -> tuple[list[Path], list[Path], list[str]]:
-        """Colour and depth images, and a line for each kind of other images that are not read.
-
-        Raises:
-            GavoError: the file that lists them cannot be read.
-        """
-        return *plain_files(path), passed_over(path)
-
-    @classmethod
-    def pair(cls, path: Path, color: list[Path], depth: list[Path], reading: Reading, seconds: Seconds) -> Paired:
-        """Pair the images to frames; `seconds` maps frame numbers to times, if the names are no stamps.
-
-        Raises:
-            GavoError: no frames, or the pairing is ambiguous.
-        """
-        return paired_by_stamp(path, color, depth, reading) or paired_by_number(path, color, depth, seconds)
-
-    @classmethod
-    def clock(cls, path: Path) -> Seconds | None:
-        """Mapping from frame numbers to times from a file in the folder; None if there is none."""
-        return None
-
-    @classmethod
-    def truth(cls, path: Path, paired: Paired) -> tuple[Trajectory | None, list[str]]:
-        """The ground truth in the folder, if any, and a line for each file of poses that is not used, with the reason.
-
-        Raises:
-            GavoError: it cannot be read.
-        """
-        found = truth_in(path, [entry.stamp for entry in paired.entries], paired.seconds, paired.times)
-        if found is not None or not (path / TRANSFORMS).is_file():
-            return found, []
-        return read_transforms(path / TRANSFORMS, {entry.color.stem: entry.stamp for entry in paired.entries})
-
-
-class Open3DFolder(PlainFolder):
-    """A folder of Open3D's reconstruction system, or of Redwood: `color/` or `image/`, `depth/`, an intrinsics file."""
-
-    kind: ClassVar[str] = "Open3D reconstruction folder"
-
-    @classmethod
-    def recognises(cls, path: Path) -> bool:
-        """Recognise a folder by the intrinsics file beside the images."""
-        return cls._intrinsics(path) is not None and super().recognises(path)
-
-    @classmethod
-    def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
-        """The camera of the intrinsics file; depth is in millimetres unless stated otherwise."""
-        file = cls._intrinsics(path)
-        assert file is not None
-        return load_calibration(file, partial(size_of_most, entries), MILLIMETRES)
-
-    @classmethod
-    def clock(cls, path: Path) -> Seconds | None:
-        """Times at the rate that Open3D's RealSense reader writes into the intrinsics file."""
-        file = cls._intrinsics(path)
-        assert file is not None
-        return by_rate(told_in(file).get("fps"))
-
-    @classmethod
-    def _intrinsics(cls, path: Path) -> Path | None:
-        names = ("camera_intrinsic.json", "camera_intrinsics.json", "intrinsic.json")
-        return next((path / name for name in names if (path / name).is_file()), None)
-
-
-def by_rate(rate: Any) -> Seconds | None:
-    """Mapping from frame numbers to times at a rate, frames per second; None if it is no plausible rate."""
-    if isinstance(rate, bool) or not isinstance(rate, int | float) or not SLOWEST <= rate <= FASTEST:
-        return None
-    return lambda numbers: numbers / rate
 
 
 def _any(folder: Path, pattern: str) -> Path | None:

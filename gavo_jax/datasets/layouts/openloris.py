@@ -13,8 +13,9 @@ from gavo_jax.camera_files.exports import OPENLORIS_COLOR
 from gavo_jax.camera_files.storage import read_storage, values_of
 from gavo_jax.camera_files.words import numbers_of
 from gavo_jax.datasets.assembly import MILLIMETRES
-from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
+from gavo_jax.datasets.files import Entry, Reading, size_of_most
 from gavo_jax.datasets.layouts.tum import TumSequence
+from gavo_jax.datasets.own_camera import own_camera_file
 from gavo_jax.datasets.truth import TRUTH, Seconds, pose_of
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.trajectory import Trajectory

@@ -12,10 +12,12 @@ from jaxtyping import Float
 
 from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.datasets.assembly import MILLIMETRES
-from gavo_jax.datasets.files import Entry, Reading, Size, own_camera_file, told_in
+from gavo_jax.datasets.files import Entry, Reading, Size
 from gavo_jax.datasets.layouts.image_folders import plain_files
-from gavo_jax.datasets.layouts.numbered import NumberedFolder, PlainFolder, by_rate, of_each_frame
+from gavo_jax.datasets.layouts.numbered import NumberedFolder, of_each_frame
 from gavo_jax.datasets.layouts.pairing import Paired
+from gavo_jax.datasets.layouts.plain_folder import PlainFolder, by_rate
+from gavo_jax.datasets.own_camera import own_camera_file, told_in
 from gavo_jax.datasets.truth import Seconds, numbers_in, posed
 from gavo_jax.errors import GavoError, data_rows
 from gavo_jax.trajectory import Trajectory, inverse

@@ -7,9 +7,11 @@ from typing import ClassVar
 
 from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.datasets.assembly import MILLIMETRES
-from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
+from gavo_jax.datasets.files import Entry, Reading, size_of_most
 from gavo_jax.datasets.layouts.image_folders import plain_files
-from gavo_jax.datasets.layouts.numbered import PlainFolder, of_each_frame
+from gavo_jax.datasets.layouts.numbered import of_each_frame
+from gavo_jax.datasets.layouts.plain_folder import PlainFolder
+from gavo_jax.datasets.own_camera import own_camera_file
 from gavo_jax.errors import GavoError
 
 

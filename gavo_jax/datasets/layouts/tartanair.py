@@ -12,9 +12,10 @@ from jaxtyping import Float
 from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.datasets.assembly import METRES
-from gavo_jax.datasets.files import Entry, Reading, own_camera_file, size_of_most
+from gavo_jax.datasets.files import Entry, Reading, size_of_most
 from gavo_jax.datasets.layouts.numbered import NumberedFolder, found_among
 from gavo_jax.datasets.names import Found
+from gavo_jax.datasets.own_camera import own_camera_file
 from gavo_jax.datasets.truth import in_order, numbers_in, posed
 from gavo_jax.errors import GavoError
 

@@ -16,16 +16,9 @@ import numpy as np
 from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import DEPTH_SCALE, Calibration, load_calibration
 from gavo_jax.datasets.clocks import in_seconds
-from gavo_jax.datasets.files import (
-    Entry,
-    FileSequence,
-    Reading,
-    own_camera_file,
-    preset_or_export,
-    resolve_folder,
-    size_of_most,
-)
+from gavo_jax.datasets.files import Entry, FileSequence, Reading, resolve_folder, size_of_most
 from gavo_jax.datasets.names import decimal_unit, filled_in, unit_of, unpaired
+from gavo_jax.datasets.own_camera import own_camera_file, preset_or_export
 from gavo_jax.datasets.truth import Seconds, truth_in, unread_truth
 from gavo_jax.errors import GavoError, as_path, data_rows, number, without_heading
 from gavo_jax.trajectory import Trajectory, associate

@@ -80,7 +80,7 @@ def is_depth(kind: str, message: Any, topic: str) -> bool:
     is_named = "depth" in topic.lower()
     if INFRARED.search(topic) and not is_named:
         return False
-    if "compressedDepth" in encoding or "32FC1" in encoding or "16UC1" in encoding or encoding == "Z16":
+    if "compressedDepth" in encoding or "32FC1" in encoding or "16UC1" in encoding or encoding in ("Z16", "64FC1"):
         return True
     return is_named and ("mono16" in encoding or kind == COMPRESSED and "jp" not in encoding.lower())
 

@@ -36,7 +36,8 @@ from gavo_jax.camera_files.calibration import load_calibration
 from gavo_jax.datasets import registry
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.files import FileSequence, Reading
-from gavo_jax.datasets.layouts.numbered import PlainFolder, ScanNet, SevenScenes
+from gavo_jax.datasets.layouts.numbered import ScanNet, SevenScenes
+from gavo_jax.datasets.layouts.plain_folder import PlainFolder
 from gavo_jax.datasets.registry import open_source, recognise, register_dataset
 from gavo_jax.datasets.selection import open_part
 from gavo_jax.errors import GavoError

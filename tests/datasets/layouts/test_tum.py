@@ -455,7 +455,7 @@ BAD_DEPTH = {
     "torn": WHOLE_DEPTH[:3000],
     "8 bits": png(np.zeros((48, 64), np.uint8)),
     "colour": WHOLE_COLOR,
-    "16-bit colour": png(np.zeros((48, 64, 3), np.uint16)),
+    "16-bit colour": png(np.arange(48 * 64 * 3, dtype=np.uint16).reshape(48, 64, 3)),
     "another size": png(np.zeros((48, 32), np.uint16)),
 }
 BAD = [("rgb", name) for name in BAD_COLOR] + [("depth", name) for name in BAD_DEPTH]

@@ -1,0 +1,113 @@
+"""Camera files that are known and not read: what helps, by the names or the words that stand in them."""
+
+import re
+from pathlib import Path
+
+from gavo_jax.camera_files.words import FOCAL, LEAST_UNITS, REQUIRED, Table
+from gavo_jax.errors import GavoError
+
+ONE_FRAME = "what is said of a frame: leave --camera out where it lies beside the images, or write fx, fy, cx and cy"
+
+BY_NAME: tuple[tuple[re.Pattern[str], str], ...] = (
+    (
+        re.compile("cameraData"),
+        "DepthAI's calibration, for the whole sensors of an OAK: write fx, fy, cx and cy of the colour camera at the "
+        "size of the images (getCameraIntrinsics(socket, width, height))",
+    ),
+    (
+        re.compile("CalibrationInformation"),
+        "Azure Kinect's raw calibration, in shares of its sensors: take the intrinsic.json that Open3D's "
+        "azure_kinect_mkv_reader.py writes",
+    ),
+    (
+        re.compile("schema version"),
+        "settings of RealSense's viewer, without intrinsics: write width, height, fx, fy, ppx, ppy, model and coeffs, "
+        "which rs-enumerate-devices -c prints",
+    ),
+    (re.compile("cameraPoseARFrame|t_00|cam_K"), ONE_FRAME),
+    (re.compile(r"\d+|frame_\d+"), f"a camera for each frame: {ONE_FRAME}"),
+    (
+        re.compile(r"(?i).*(fov|aperture|angle|focal|sensor_?width).*"),
+        "a lens or an angle of view in place of fx and fy: those are width / (2 tan(angle / 2)), or width * focal "
+        "length / aperture, and the middle of an image is cx = (width - 1) / 2",
+    ),
+)
+"""Names of entries, and what a file with such an entry is, in the order in which they are tried."""
+
+IN_TEXT: tuple[tuple[str, str], ...] = (
+    (r"(?i)\bppx\b", "of RealSense's: write width, height, fx, fy, ppx, ppy, model and coeffs into a .json"),
+    (r"^(P\d|P_rect_\d\d|K_\d\d):", "of KITTI's: write the first, sixth, third and seventh number of the images' P"),
+    (r"^\s*fx\s*:", "with names, call it .yaml"),
+    (r"^\s*fx\s*=", "with names, call it .toml"),
+    (r"^\s*fx\s+[-+\d]", "with names, put = behind each and call it .toml"),
+)
+"""Patterns in a text of numbers that are not read, and what helps."""
+
+BY_ENDING = {
+    ".npy": "write it as text: numpy.savetxt('camera.txt', numpy.load(FILE))",
+    ".npz": "write its matrix as text: numpy.savetxt('camera.txt', …)",
+    ".conf": "a ZED's is for images that are not rectified, which its SDK does not export: write the left camera of "
+    "its calibration_parameters as .toml",
+    ".ini": "call it .toml, with one camera's fx = …, fy = …, cx = … and cy = … in it",
+    ".cfg": "call it .toml, or .txt where it is a matrix or a row of numbers",
+    ".bin": "COLMAP's: write it as cameras.txt (colmap model_converter --output_type TXT)",
+}
+"""What helps with files of other endings."""
+
+DEEPEST = 3
+"""Levels of tables in which cameras are looked for."""
+
+
+def refuse_foreign(path: Path, values: Table) -> None:
+    """Refuse a table of a known kind that is not read, or whose cameras lie within; otherwise do nothing.
+
+    Raises:
+        GavoError: the message says what would help.
+    """
+    if {*FOCAL} & values.keys():
+        return
+    if within := _cameras_within(values, ""):
+        names = ", ".join(within[:3])
+        raise GavoError(f"{path}: a camera in {names}: write that of colour alone, its fx, fy, cx and cy at the top")
+    for pattern, words in BY_NAME:
+        if any(pattern.fullmatch(name) for name in values):
+            raise GavoError(f"{path}: {words}")
+
+
+def _cameras_within(values: Table, above: str) -> list[str]:
+    """Places of the tables that hold a camera, as `color` or `Dataset.Calibration`."""
+    found = []
+    for name, inner in values.items():
+        if not isinstance(inner, dict):
+            continue
+        place = f"{above}{name[:60]}"
+        found += [place] if {"fx", "fy"} <= inner.keys() else []
+        if place.count(".") + 1 < DEEPEST:
+            found += _cameras_within({str(key): value for key, value in inner.items()}, f"{place}.")
+    return found
+
+
+def hint_of_text(text: str) -> str:
+    """What helps with a text of numbers that is not read, after a colon; empty where nothing is known."""
+    words = next((words for pattern, words in IN_TEXT if re.search(pattern, text, re.MULTILINE)), "")
+    return words and f": {words}"
+
+
+def hint_of_ending(path: Path) -> str:
+    """What helps with a file of another ending, after a colon; empty where nothing is known."""
+    words = BY_ENDING.get(path.suffix.lower(), "")
+    return words and f": {words}"
+
+
+def refuse_bop_camera(path: Path, values: Table) -> None:
+    """Refuse the `camera.json` of a BOP dataset, which has our keys, and millimetres per unit in `depth_scale`.
+
+    Raises:
+        GavoError: the message says what to write.
+    """
+    scale = values.get("depth_scale")
+    if values.keys() == {*REQUIRED, "depth_scale"} and isinstance(scale, float) and LEAST_UNITS <= scale < 1:
+        raise GavoError(
+            f"{path}: depth_scale: {scale:g}: less than a unit per metre: BOP's are millimetres per unit: write "
+            f"{1000 / scale:g}, of units per metre"
+        )

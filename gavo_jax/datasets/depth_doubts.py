@@ -1,0 +1,167 @@
+"""Depth images that hold something else than depth: swapped bytes, stretched pictures, disparity, limits.
+
+Each is recognised by what only its own numbers do, whatever the scene. What `fault_of_depth` finds is refused before a
+run; `doubt_of_depth` is said by `gavo inspect` alone.
+"""
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Shaped, UInt16
+
+from gavo_jax.datasets.base import FrameError
+from gavo_jax.datasets.base import Sequence as FrameSequence
+from gavo_jax.datasets.depth_unit import doubt_of_scale, fault_of_scale, first_depths, reader_of, unit_of_file
+from gavo_jax.datasets.images import without_invalid
+from gavo_jax.image.numbers import NO_READING
+
+FEWEST = 1000
+"""Fewest readings, or pairs of neighbouring ones, that are judged."""
+
+SWAPPED = 8.0
+"""Mean step between neighbours over that after the bytes are swapped, from which on they count as swapped. The steps of
+real depth are a hundred times smaller than those of its swapped numbers; those of noise are equal."""
+
+STRETCHES, DISTINCT = (257, 256), 16
+"""Factors by which programs stretch 8 bits to 16, and the fewest different numbers that tell."""
+
+RAW_KINECT = 2047
+"""What a Kinect's raw disparity, of 11 bits, has where there is no reading."""
+
+MUCH, GAP = 0.05, 0.95
+"""Share of the readings at the farthest one, and next farthest reading over it, from which on that is a limit."""
+
+ROUND_LIMIT = 5.0
+"""Whole numbers of metres from here on are limits, too: no scene has much of itself just there."""
+
+SAMPLED_FOR_PLANES = 9
+"""Number of frames, spread over the sequence, in which flat surfaces are looked for."""
+
+PATCHES, FULL = (8, 5), 0.9
+"""Patches along an image's width (they overlap by half), and the share of readings that a patch needs."""
+
+WIDTH = 320
+"""Columns of an image that are enough for patches."""
+
+RECEDING = 1.15
+"""Farthest over nearest reading from which on a patch tells a plane's depth from its inverse."""
+
+FLAT, FLATTER = 0.05, 1.5
+"""Largest deviation of a flat patch, as a share of its standard deviation, and how often it goes into the other's."""
+
+PLANES, MOST_OTHERS = 6, 0.1
+"""Fewest flat patches for a judgement, and the largest share of them that may say the opposite."""
+
+
+def fault_of_depth(sequence: FrameSequence) -> str | None:
+    """Describe why the depth of a sequence is no depth, or in the wrong unit; None if nothing tells.
+
+    Judged by its first frames, except those that cannot be read.
+    """
+    images = [image for image in first_depths(sequence) if image.dtype == np.uint16]
+    return _fault_of_numbers(images) or fault_of_scale(sequence)
+
+
+def _fault_of_numbers(images: Sequence[UInt16[np.ndarray, "h w"]]) -> str | None:
+    readings = (
+        np.concatenate([image[(image > 0) & (image < NO_READING)] for image in images]) if images else np.empty(0)
+    )
+    if readings.size < FEWEST:
+        return None
+    values = np.unique(readings)
+    for factor in STRETCHES:
+        if len(values) >= DISTINCT and not (values % factor).any():
+            return (
+                f"every number is a multiple of {factor}: 8 bits stretched to 16, of a picture of depth: write depth "
+                "itself as 16 bits or floats"
+            )
+    if values[-1] == RAW_KINECT and np.mean(readings == RAW_KINECT) > MUCH and all(image.all() for image in images):
+        return f"{RAW_KINECT} in place of no reading: the raw disparity of a Kinect: write its depth in millimetres"
+    as_stored, swapped = _mean_step(images), _mean_step([image.byteswap() for image in images])
+    if as_stored > SWAPPED * swapped > 0:
+        return (
+            f"neighbouring pixels differ by {as_stored:.0f}, and by {swapped:.0f} once both bytes of each number are "
+            "swapped: written in the wrong order of bytes: swap them (NumPy's byteswap)"
+        )
+    return None
+
+
+def _mean_step(images: Sequence[UInt16[np.ndarray, "h w"]]) -> float:
+    """Mean difference of horizontal neighbours that both have a reading; 0 if there are too few."""
+    steps = []
+    for image in images:
+        left, right = image[:, :-1].astype(np.int32), image[:, 1:].astype(np.int32)
+        has_both = (np.minimum(left, right) > 0) & (np.maximum(left, right) < NO_READING)
+        steps.append(np.abs(left - right)[has_both])
+    found = np.concatenate(steps)
+    return float(found.mean()) if found.size >= FEWEST else 0.0
+
+
+def doubt_of_depth(sequence: FrameSequence) -> str | None:
+    """Describe what is unusual in the depth of a sequence, besides a `fault_of_depth`; None if nothing is."""
+    of_scale = None if fault_of_depth(sequence) else doubt_of_scale(sequence)
+    doubts = (of_scale, _limit(sequence), _inverse(sequence))
+    return "; ".join(filter(None, doubts)) or None
+
+
+def _limit(sequence: FrameSequence) -> str | None:
+    """Describe a limit that many readings have in place of none, as simulators and filters leave it."""
+    images = [without_invalid(image) for image in first_depths(sequence)]
+    readings = np.concatenate([image[image > 0] for image in images]) if images else np.empty(0)
+    if readings.size < FEWEST:
+        return None
+    most, scale = float(readings.max()), unit_of_file(sequence)
+    share, nearer = float(np.mean(readings == readings.max())), readings[readings < readings.max()]
+    if not nearer.size:
+        return f"every reading is {most / scale:.4g} m"
+    is_round = most / scale >= ROUND_LIMIT and most % scale == 0
+    if share < MUCH or not (is_round or nearer.max() < GAP * most):
+        return None
+    return (
+        f"{100 * share:.0f} % of the readings are {most / scale:.4g} m, the farthest: where that is a limit, or stands "
+        "for no reading, write 0"
+    )
+
+
+def _inverse(sequence: FrameSequence) -> str | None:
+    """Describe numbers that grow with nearness, by flat surfaces: there, the inverse of depth is a plane, not depth."""
+    read, straight, opposite = reader_of(sequence), 0, 0
+    for at in sorted({round(place) for place in np.linspace(0, len(sequence) - 1, SAMPLED_FOR_PLANES)}):
+        try:
+            of_numbers, of_inverse = _flat_patches(without_invalid(read(at)).astype(np.float64))
+        except FrameError:
+            continue
+        straight, opposite = straight + of_numbers, opposite + of_inverse
+    if straight < PLANES or opposite > MOST_OTHERS * straight:
+        return None
+    return (
+        f"{straight} flat patches are flat in these numbers, and {opposite} in their inverse, where those of depth "
+        "are: disparity or inverse depth, it seems, as MiDaS estimates it: write depth"
+    )
+
+
+def _flat_patches(image: Float[np.ndarray, "h w"]) -> tuple[int, int]:
+    """Number of patches that are planes in the image's numbers alone, and in their inverse alone."""
+    step = max(1, image.shape[1] // WIDTH)
+    numbers, found = image[::step, ::step], [0, 0]
+    for side in (max(numbers.shape[1] // patches, 4) for patches in PATCHES):
+        y, x = (grid.ravel() for grid in np.mgrid[:side, :side])
+        base = np.stack([np.ones(side * side), x, y], axis=1)
+        rows, columns = (range(0, length - side + 1, side // 2) for length in numbers.shape)
+        for top, left in itertools.product(rows, columns):
+            patch = numbers[top : top + side, left : left + side].ravel()
+            some = patch > 0
+            near, far = np.percentile(patch[some], [2, 98]) if some.mean() >= FULL else (1.0, 0.0)
+            if far < RECEDING * near:
+                continue
+            off = [_off_plane(base[some], values) for values in (patch[some], 1 / patch[some])]
+            if min(off) < FLAT and max(off) > FLATTER * min(off):
+                found[off[1] < off[0]] += 1
+    return found[0], found[1]
+
+
+def _off_plane(base: Float[np.ndarray, "n 3"], values: Shaped[np.ndarray, " n"]) -> float:
+    """Deviation of values from their plane, as a share of their standard deviation."""
+    plane, *_ = np.linalg.lstsq(base, values, rcond=None)
+    return float(np.std(values - base @ plane) / np.std(values))
