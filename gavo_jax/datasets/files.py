@@ -246,7 +246,7 @@ class FileSequence:
         for entry in self.entries:
             for path in (entry.color, entry.depth):
                 if path is not None and not os.path.isfile(file_of(path)):
-                    raise GavoError(f"{path}: {_instead(path)}: restore it, or leave its frame out")
+                    raise GavoError(f"{path}: {_instead(path)}: restore it, or omit its frame")
         self[0]
 
 
@@ -288,8 +288,8 @@ def own_camera_file(folder: Path) -> Path | None:
     other = file.with_name(re.sub("(_|^)color", r"\1depth", file.name))
     if other.is_file() and read_text(other).split() != read_text(file).split():
         raise GavoError(
-            f"{file}: {other.name} beside it is of another camera: say --camera with a file of both cameras "
-            "([depth], colour_T_depth), or of one if depth is registered to colour"
+            f"{file}: {other.name} beside it belongs to another camera: pass --camera with a file for both "
+            "cameras ([depth], colour_T_depth), or for one if depth is registered to colour"
         )
     return file
 
@@ -438,6 +438,6 @@ def open_pair(
     """
     for color, depth in images:
         if Path(color) == Path(depth):
-            raise GavoError(f"{color}: given as colour and as depth alike")
+            raise GavoError(f"{color}: given as both colour and depth")
     entries = [Entry(0.0, Path(color), Path(depth)) for color, depth in images]
     return FileSequence("pair", entries, calibration, reading=reading)

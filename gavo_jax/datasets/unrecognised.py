@@ -33,32 +33,32 @@ PACKED = {
 """Suffixes of archives, and the command that unpacks each."""
 
 RECORDINGS = {
-    ".sens": "a scan as ScanNet packs it: export it with ScanNet's SensReader, and name the folder",
-    ".mkv": "a film, or a recording of Azure Kinect: write its images with Open3D's azure_kinect_mkv_reader.py",
-    ".svo": "a recording of a ZED: write its images and depth with the ZED SDK's export samples",
-    ".svo2": "a recording of a ZED: write its images and depth with the ZED SDK's export samples",
-    ".oni": "a recording of OpenNI: write its images and depth with OpenNI's tools",
-    ".r3d": "a recording of Record3D: export it in the app as EXR + RGB, and name the folder of rgb/ and depth/",
-    ".klg": "a log of ElasticFusion's logger: write its images and depth first",
+    ".sens": "a packed ScanNet scan: export it with ScanNet's SensReader, and pass the folder",
+    ".mkv": "a film or an Azure Kinect recording: extract its images with Open3D's azure_kinect_mkv_reader.py",
+    ".svo": "a ZED recording: extract its images and depth with the ZED SDK's export samples",
+    ".svo2": "a ZED recording: extract its images and depth with the ZED SDK's export samples",
+    ".oni": "an OpenNI recording: extract its images and depth with OpenNI's tools",
+    ".r3d": "a Record3D recording: export it in the app as EXR + RGB, and pass the folder with rgb/ and depth/",
+    ".klg": "a log of ElasticFusion's logger: extract its images and depth first",
 }
 """Suffixes of proprietary recordings, and how to convert each."""
 
-ARRAYS = "write its colour and depth as images into rgb/ and depth/, or as .npy of one frame each"
+ARRAYS = "write its colour and depth as images into rgb/ and depth/, or as one .npy per frame"
 
 PACKED_ARRAYS = {
     **dict.fromkeys((".hdf5", ".h5"), f"arrays in HDF5: {ARRAYS} (h5py)"),
-    ".mat": f"arrays of MATLAB: {ARRAYS} (scipy.io.loadmat, or h5py from version 7.3 on)",
-    **dict.fromkeys((".npz", ".npy", ".pkl"), f"arrays of Python: {ARRAYS}"),
+    ".mat": f"MATLAB arrays: {ARRAYS} (scipy.io.loadmat, or h5py from version 7.3 on)",
+    **dict.fromkeys((".npz", ".npy", ".pkl"), f"Python arrays: {ARRAYS}"),
     **dict.fromkeys((".parquet", ".arrow", ".tfrecord"), f"a table: {ARRAYS}"),
-    ".raw": f"images without a head: {ARRAYS}; of rs-convert name the .bag that it has read",
-    ".rrd": f"a recording of Rerun: {ARRAYS}",
+    ".raw": f"images without a header: {ARRAYS}; after rs-convert, pass the .bag that it has read",
+    ".rrd": f"a Rerun recording: {ARRAYS}",
 }
 """What holds images in a form that is no image's and no recording's."""
 
 MODELS = (".ply", ".pcd", ".obj", ".glb", ".usdz", ".e57", ".las")
 """Endings of files of points or surfaces."""
 
-MODEL = "a model or a cloud of points, without the images that it was made of"
+MODEL = "a model or a point cloud, without the images that it was made from"
 
 DEPTH_IN_NAME = re.compile(r"(?<![a-z])depth", re.IGNORECASE)
 
@@ -92,10 +92,10 @@ def describe(path: Path, kinds: Sequence[str], is_source: Callable[[Path], bool]
         kinds: The known kinds of sources.
         is_source: Tells whether another path holds one of them.
     """
-    known = f"{', '.join(WHAT_OF.sub('', kind) for kind in kinds)} (SUN3D's, too)"
+    known = f"{', '.join(WHAT_OF.sub('', kind) for kind in kinds)} (including SUN3D's)"
     if not path.is_dir():
         if path.is_file() and (source := source_around(path, is_source)):
-            return f"a file of a source: name its folder, {source}"
+            return f"a file inside a source: pass its folder, {source}"
         return _in_file(path) or f"a file of {path.stat().st_size} bytes, not one of: {known}"
     place = Place(path, sorted(path.iterdir()), known, is_source)
     return next(words for guess in GUESSES if (words := guess(place)) is not None)
@@ -123,8 +123,8 @@ def _frames_apart(place: Place) -> str | None:
     if len(folders) < 2 or any(tuple(map(len, plain_files(folder))) != (1, 1) for folder in folders):
         return None
     return (
-        f"{len(folders)} folders of one frame each, as {folders[0].name[:60]}: if they are of one recording, link "
-        "their images into rgb/ and depth/, by the numbers of the folders"
+        f"{len(folders)} folders of one frame each, such as {folders[0].name[:60]}: if they belong to one recording, "
+        "link their images into rgb/ and depth/, named by the numbers of the folders"
     )
 
 
@@ -132,8 +132,8 @@ def _sources(place: Place) -> str | None:
     names = [child.name for child in place.inside if not child.name.startswith(".") and place.is_source(child)]
     if not names:
         return None
-    there = f"{len(names)}: name one of {_listed(names)}" if len(names) > 1 else f"one: name {names[0][:60]}"
-    return f"no source itself, but a folder of {there}"
+    there = f"{len(names)}: pass one of {_listed(names)}" if len(names) > 1 else f"one: pass {names[0][:60]}"
+    return f"not a source itself, but a folder of {there}"
 
 
 def _images_missing(place: Place) -> str | None:
@@ -147,17 +147,17 @@ def _stereo(place: Place) -> str | None:
         return None
     if (stereo / "depth0" / "data").is_dir():
         return (
-            f"{stereo / 'depth0'}: link its images as depth/, beside rgb/; InteriorNet's, which are lengths of rays, "
+            f"{stereo / 'depth0'}: link its images as depth/, beside rgb/; InteriorNet's are ray lengths, and "
             "have to be written there as z = length / sqrt(1 + x^2 + y^2)"
         )
-    return f"{stereo / 'cam0'}: a recording as EuRoC has it, of stereo images without depth, which this needs"
+    return f"{stereo / 'cam0'}: a recording in the layout of EuRoC: stereo images without depth, which is required"
 
 
 def _nyu(place: Place) -> str | None:
     if not (any(place.path.glob("d-*.pgm")) and any(place.path.glob("r-*.ppm"))):
         return None
     return (
-        "the raw recording of NYU Depth, whose depth is in units of disparity: write rgb/ and depth/ with the "
+        "a raw recording of NYU Depth, whose depth is in units of disparity: write rgb/ and depth/ with the "
         "dataset's toolbox first"
     )
 
@@ -165,16 +165,14 @@ def _nyu(place: Place) -> str | None:
 def _spectacular(place: Place) -> str | None:
     if not all((place.path / name).is_file() for name in ("data.jsonl", "calibration.json")):
         return None
-    return (
-        "a recording of Spectacular AI: write its images with sai-cli process, and name the folder of transforms.json"
-    )
+    return "a Spectacular AI recording: extract its images with sai-cli process, and pass the folder of transforms.json"
 
 
 def _scannet_plus_plus(place: Place) -> str | None:
     if not all((place.path / name).is_file() for name in ("depth.bin", "pose_intrinsic_imu.json")):
         return None
     return (
-        "the iPhone's part of a scan of ScanNet++, its images still packed: write rgb/ and depth/ with "
+        "the iPhone's part of a ScanNet++ scan, its images still packed: write rgb/ and depth/ with "
         "iphone/prepare_iphone_data.py of its toolbox (extract_rgb, extract_depth)"
     )
 
@@ -183,17 +181,17 @@ def _rays(place: Place) -> str | None:
     rays = "have to be written into depth/, beside rgb/, as z = length / sqrt(1 + x^2 + y^2)"
     names = {child.name for child in place.inside}
     if {"photo", "depth", "instance"} <= names:
-        return f"depth/: SceneNet RGB-D's are lengths of rays, which {rays}; link photo/ as rgb/"
+        return f"depth/: SceneNet RGB-D stores ray lengths, which {rays}; link photo/ as rgb/"
     if (found := next((name for name in sorted(names) if name.startswith("distance_to_camera")), None)) is None:
         return None
-    return f"{found[:60]}: Replicator's lengths of rays: write distance_to_image_plane there, or they {rays}"
+    return f"{found[:60]}: ray lengths from Replicator: have it write distance_to_image_plane, or they {rays}"
 
 
 def _mid_air(place: Place) -> str | None:
     if not any((place.path / "color_left").glob("trajectory_*")):
         return None
     return (
-        "recordings of Mid-Air, whose PNG hold floats of 16 bits: of a trajectory write depth = 512 / disparity of "
+        "recordings of Mid-Air, whose PNG contain 16-bit floats: for a trajectory, write depth = 512 / disparity from "
         "stereo_disparity/ as TIFF or .npy of floats into depth/, beside rgb/ with the images of color_left/"
     )
 
@@ -206,22 +204,22 @@ def _recording(place: Place) -> str | None:
 
 def _record_3d(place: Place) -> str | None:
     is_unzipped = (place.path / "rgbd").is_dir() and (place.path / "metadata").is_file()
-    return f"unzipped, {RECORDINGS['.r3d']}" if is_unzipped else None
+    return f"the contents of {RECORDINGS['.r3d']}" if is_unzipped else None
 
 
 def _le_robot(place: Place) -> str | None:
     is_one = (place.path / "meta" / "info.json").is_file() and (place.path / "data").is_dir()
-    return f"a dataset of LeRobot, of films and tables: of one episode {ARRAYS}" if is_one else None
+    return f"a LeRobot dataset of films and tables: for one episode, {ARRAYS}" if is_one else None
 
 
 def _part_of_source(place: Place) -> str | None:
     source = source_around(place.path, place.is_source)
-    return source and f"a folder inside a source: name the source, {source}"
+    return source and f"a folder inside a source: pass the source, {source}"
 
 
 def _further_down(place: Place) -> str | None:
     found = next((inner for inner in islice(_two_down(place), LOOKED_INTO) if place.is_source(inner)), None)
-    return found and f"no source itself, but one lies further down: name {found.relative_to(place.path)}"
+    return found and f"not a source itself, but contains one: pass {found.relative_to(place.path)}"
 
 
 def _two_down(place: Place) -> Iterator[Path]:
@@ -276,11 +274,11 @@ def _in_file(file: Path) -> str | None:
     """Describe how to turn a file into a source, judged by its name; None where the name tells nothing."""
     before, last = ["", "", *(suffix.lower() for suffix in file.suffixes)][-2:]
     if (before, last) == (".bag", ".active"):
-        return "a recording that was never closed: mend it with rosbag reindex, and name it .bag"
+        return "a recording that was never closed: repair it with rosbag reindex, and rename it to .bag"
     if last in FILMS and DEPTH_IN_NAME.search(file.name):
         return (
-            "a film of depth: where it has 16 bits, write its frames as images into depth/, beside rgb.mp4 or rgb/ "
-            "(ffmpeg -i FILM -start_number 0 depth/%06d.png); one of 8 bits is a picture of depth, and of no use"
+            "a film of depth: if it has 16 bits, write its frames as images into depth/, beside rgb.mp4 or rgb/ "
+            "(ffmpeg -i FILM -start_number 0 depth/%06d.png); one of 8 bits is only a picture of depth, and useless"
         )
     if last in RECORDINGS:
         return RECORDINGS[last]

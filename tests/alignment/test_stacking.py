@@ -82,7 +82,7 @@ def test_grey_levels_about_zero_are_refused(shift: float, small_frames: dict[int
         lambda: align(shifted, frame, CAMERA, NEWTON),
         lambda: Odometry(CAMERA, NEWTON).register(shifted, 0.0),
     ):
-        with pytest.raises(GavoError, match="grey levels reach from 0 to 255, not from -"):
+        with pytest.raises(GavoError, match="grey levels must range from 0 to 255, not from -"):
             call()
 
 

@@ -99,9 +99,7 @@ def several_pairs(path: Path) -> str | None:
     if len(pairs) < 2:
         return None
     names = ", ".join(color.name[:60] for (color, *_), _ in pairs[:3]) + ", …" * (len(pairs) > 3)
-    return (
-        f"{len(pairs)} folders of colour have one of depth beside them ({names}): link those of one as rgb/ and depth/"
-    )
+    return f"{len(pairs)} colour folders have a depth folder beside them ({names}): link one pair as rgb/ and depth/"
 
 
 def _is_depth_beside(color: re.Match[str], name: str) -> bool:
@@ -123,7 +121,7 @@ def passed_over(path: Path) -> list[str]:
     words = []
     for kind, some, suffixes in zip(("colour", "depth"), candidates, (COLOR_SUFFIXES, DEPTH_SUFFIXES), strict=True):
         others = [child for child in some[1:] if images_among(child.glob("*"), suffixes)]
-        words += [f"{other.name}/: not read, {kind} is that of {some[0].name}/" for other in others]
+        words += [f"{other.name}/: not read, {kind} comes from {some[0].name}/" for other in others]
     return words
 
 
@@ -135,7 +133,7 @@ def missing_images(path: Path) -> str | None:
     for kind, folder, suffixes in (("colour", color, COLOR_SUFFIXES), ("depth", depth, DEPTH_SUFFIXES)):
         if not images_among(folder.glob("*"), (*suffixes, ".npy")):
             inside = ", ".join(child.name[:60] for child in sorted(folder.glob("*"))[:2]) or "empty"
-            return f"no {kind} images in {folder.name} ({inside}): those end in {', '.join(suffixes)}"
+            return f"no {kind} images in {folder.name} ({inside}): expected names ending in {', '.join(suffixes)}"
     return None
 
 
@@ -192,4 +190,4 @@ def missing_word(path: Path) -> str | None:
     files = images_among(path.glob("*"), ALL_SUFFIXES)
     if not files or len(_with_depth(files)) < len(files):
         return None
-    return f"all images have depth in their names, as {files[0].name[:60]}: those without it are colour"
+    return f"all images have depth in their names, such as {files[0].name[:60]}: only those without it are colour"
