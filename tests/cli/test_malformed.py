@@ -108,9 +108,9 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         ["associations.txt:1", "expected"],
     ),
     "image: empty": ("tum", write(f"rgb/{FIRST}", b""), [FIRST, "empty file"]),
-    "image: torn PNG": ("tum", cut(f"rgb/{FIRST}", 0.5), [FIRST, "torn PNG", "anew"]),
-    "image: text": ("tum", write(f"rgb/{FIRST}", "hello"), [FIRST, "no image", "hello"]),
-    "image: torn JPEG": ("scannet", cut("color/0.jpg", 0.5), ["color/0.jpg", "truncated or damaged", "anew"]),
+    "image: torn PNG": ("tum", cut(f"rgb/{FIRST}", 0.5), [FIRST, "truncated PNG", "again"]),
+    "image: text": ("tum", write(f"rgb/{FIRST}", "hello"), [FIRST, "not an image", "hello"]),
+    "image: torn JPEG": ("scannet", cut("color/0.jpg", 0.5), ["color/0.jpg", "truncated or damaged", "again"]),
     "image: torn JPEG, deep": ("replica", cut("results/frame000000.jpg", 0.9), ["frame000000.jpg", "or damaged"]),
     "image: another size": ("plain", pixels("rgb/0.png", SMALL), ["rgb/0.png", "80x60", "160x120", "--camera"]),
     "image: of floats": (
@@ -160,7 +160,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     "7-scenes: a skewed pose": (
         "seven_scenes",
         lambda clip: np.savetxt(clip / "frame-000002.pose.txt", 3 * np.eye(4)),
-        ["000002.pose.txt", "no rotation"],
+        ["000002.pose.txt", "not a rotation"],
     ),
     "7-scenes: intrinsics of prose": (
         "seven_scenes",
@@ -330,11 +330,15 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         write("extrinsic.txt", "up\n"),
         ["extrinsic.txt:1: expected the"],
     ),
-    "airsim: a torn row": ("airsim", cut("airsim_rec.txt", 0.81), ["airsim_rec.txt:5: expected 10 values"]),
+    "airsim: a torn row": (
+        "airsim",
+        cut("airsim_rec.txt", 0.81),
+        ["airsim_rec.txt:5: expected 10 tab-separated values"],
+    ),
     "airsim: a file of prose": (
         "airsim",
         write("airsim_rec.txt", "up\n"),
-        ["airsim_rec.txt: expected names of columns"],
+        ["airsim_rec.txt: expected tab-separated column names"],
     ),
     "airsim: no camera": ("airsim", remove("camera.toml"), ["clip: no camera file in it", "--camera"]),
     "rtabmap: a camera of prose": (
@@ -368,7 +372,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     "tum: icl's truth, twice": (
         "associations",
         lambda clip: [write(f"{i}.gt.freiburg", "1 0 0 0 0 0 0 1\n")(clip) for i in "ab"],
-        ["clip: a.gt.freiburg and b.gt.freiburg", "leave one"],
+        ["clip: contains both a.gt.freiburg and b.gt.freiburg", "keep only one"],
     ),
     "plain: no camera": ("plain", remove("camera.yaml"), ["clip", "no camera file", "no camera known", "--camera"]),
     "plain: YAML that is none": ("plain", write("camera.yaml", "fx: [1, 2"), ["camera.yaml", "not YAML"]),
@@ -384,7 +388,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     "plain: colour of another ending": (
         "plain",
         lambda clip: [file.rename(file.with_suffix(".raw")) for file in list((clip / "rgb").iterdir())],
-        ["clip: no colour images in rgb (0.raw, 1.raw)", "end in .png"],
+        ["clip: no colour images in rgb (0.raw, 1.raw)", "ending in .png"],
     ),
     "plain: folders of other names": (
         "plain",
@@ -419,7 +423,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     "kalibr: another kind of camera": (
         "plain",
         write("camera.yaml", "cam0:\n  camera_model: omni\n"),
-        ["camera.yaml: camera_model 'omni': pinhole"],
+        ["camera.yaml: camera_model 'omni': only pinhole"],
     ),
     "plain: only colour": ("plain", remove("depth"), ["clip: a folder of", "no folder of depth beside rgb/"]),
     "nothing at all": (
@@ -495,7 +499,7 @@ OTHERS: dict[str, tuple[Callable[[Path], Path], list[str]]] = {
     "a path that cannot be": (lambda path: path / ("x" * 300), ["unusable"]),
     "a film": (file_of("walk.mp4", bytes(100)), ["walk.mp4", "a film", "frames as images"]),
     "record3d": (file_of("walk.r3d", b"PK"), ["walk.r3d", "Record3D", "EXR + RGB"]),
-    "nyu": (nyu, ["room: the raw recording of NYU Depth", "toolbox", "rgb/ and depth/"]),
+    "nyu": (nyu, ["room: a raw recording of NYU Depth", "toolbox", "rgb/ and depth/"]),
     "euroc": (euroc, ["mav0/cam0: a recording in the layout of EuRoC", "without depth"]),
     "bag: empty": (file_of("x.bag", b""), ["x.bag", "cannot be read as a bag"]),
     "bag: text": (file_of("x.bag", b"hello"), ["x.bag", "cannot be read as a bag"]),
