@@ -66,7 +66,7 @@ def test_absurd_voxels_are_refused(voxel: Any) -> None:
 def test_a_map_of_something_else_is_refused() -> None:
     with pytest.raises(GavoError, match="a Camera is needed, not str"):
         MapBuilder("fr1")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(GavoError, match="a Sequence is needed, not NoneType"):
+    with pytest.raises(GavoError, match="expected a Sequence, got NoneType"):
         build_map(None, ())  # pyright: ignore[reportArgumentType]
 
 

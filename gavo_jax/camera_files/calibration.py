@@ -72,10 +72,10 @@ class Calibration:
     def __post_init__(self) -> None:
         """Raise GavoError if the depth camera's pose is missing or not a rigid transform."""
         if (self.depth is None) != (self.color_T_depth is None):
-            raise GavoError("a calibration has a depth camera and color_T_depth, or neither: depth is registered then")
+            raise GavoError("a calibration needs a depth camera and color_T_depth, or neither if depth is registered")
         place = self.color_T_depth
         if place is not None and not (np.shape(place) == (4, 4) and is_rigid(place, ROTATION_TOLERANCE)):
-            raise GavoError("color_T_depth: a 4x4 matrix is needed, of a rotation and a translation")
+            raise GavoError("color_T_depth: expected a 4x4 matrix of a rotation and a translation")
 
     def with_depth_scale(self, scale: float) -> "Calibration":
         """The same calibration with a known depth scale."""
@@ -152,7 +152,7 @@ def load_calibration(
     table, origin = PARSERS[suffix](path, read_text(path, most)), str(path)
     projection = table.pop(PROJECTION, None)
     if is_rectified and projection is not None:
-        table, origin = _rectified(path, table, projection), f"{path}, its lens left aside: the images are rectified"
+        table, origin = _rectified(path, table, projection), f"{path}, without its lens: the images are rectified"
     if size is not None and not {"width", "height"} <= table.keys():
         width, height = size() if callable(size) else size
         table = {"width": width, "height": height, **table}
@@ -175,7 +175,7 @@ def _rectified(path: Path, table: Table, projection: Any) -> Table:
     if projection in ([], [0] * 12):
         return table
     if not isinstance(projection, list) or len(projection) != 12:
-        raise GavoError(f"{path}: {PROJECTION}: must be twelve numbers, of three rows and four columns")
+        raise GavoError(f"{path}: {PROJECTION}: must be twelve numbers (three rows of four)")
     return {**table, "fx": projection[0], "cx": projection[2], "fy": projection[5], "cy": projection[6]}
 
 
@@ -210,7 +210,7 @@ def camera_from_table(path: Path | str, values: Table, depth_scale: float, part:
     width, height = whole("width"), whole("height")
     distortion, model = _distortion(path, part, values)
     if isinstance(values["fy"], int | float) and values["fy"] < 0:
-        why = "as ICL-NUIM has it for a world whose y points up: leave the sign out, as rows run from the top"
+        why = "as in ICL-NUIM, where y points up: remove the sign, since image rows run from the top"
         raise GavoError(f"{path}: {part}fy: negative ({shown(values['fy'])}), {why}")
     cx, cy = number("cx", -width, 2 * width), number("cy", -height, 2 * height)
     _check_middle(f"{path}: {part}cx, {part}cy", (cx, cy), (width, height))
@@ -237,8 +237,8 @@ def _check_middle(place: str, point: tuple[float, float], size: Size) -> None:
     if is_turned or abs(x - y) < LIKE and abs(x - 1) > OFF_CENTRE and abs(y - 1) > OFF_CENTRE:
         other = f"{2 * point[0]:.0f}x{2 * point[1]:.0f}"
         raise GavoError(
-            f"{place}: {point[0]:g} {point[1]:g}: the middle of an image of about {other}, not of {size[0]}x{size[1]}: "
-            f"{'turn' if is_turned else 'scale'} fx, fy, cx and cy to the images"
+            f"{place}: {point[0]:g} {point[1]:g} is the middle of an image of about {other}, not of "
+            f"{size[0]}x{size[1]}: {'rotate' if is_turned else 'scale'} fx, fy, cx and cy to match the images"
         )
 
 
@@ -246,7 +246,7 @@ def _distortion(path: Path | str, part: str, values: Table) -> tuple[tuple[float
     given = values.get("model", "pinhole")
     model = model_of(given)
     if model is None:
-        raise GavoError(f"{path}: {part}model: {shown(given)} is none of {', '.join(MODELS)}")
+        raise GavoError(f"{path}: {part}model: {shown(given)} is not one of {', '.join(MODELS)}")
     numbers = values.get("distortion", [])
     lengths = (0, *DISTORTION_COUNTS[model])
     if not isinstance(numbers, list) or len(numbers) not in lengths or ("distortion" in values and numbers == []):
@@ -255,7 +255,7 @@ def _distortion(path: Path | str, part: str, values: Table) -> tuple[tuple[float
             if model == "fisheye"
             else "4, 5, 8, 12 or 14 numbers (k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]])"
         )
-        raise GavoError(f"{path}: {part}distortion: must be a list of {wanted}, not of {_count(numbers)}")
+        raise GavoError(f"{path}: {part}distortion: must be a list of {wanted}, not {_count(numbers)}")
     tangential = MOST_RADIAL if model == "fisheye" else MOST_TANGENTIAL
     most = (MOST_K1, MOST_RADIAL, tangential, tangential, *[MOST_RADIAL] * 10)
     checked = tuple(
@@ -282,7 +282,7 @@ def _depth_camera(path: Path, table: Table) -> tuple[Camera | None, np.ndarray |
         return None, None
     if not isinstance(depth, dict):
         raise GavoError(
-            f"{path}: depth: needs the table [depth] with fx, fy, cx, cy, width and height, beside colour_T_depth"
+            f"{path}: depth: expected a table [depth] with fx, fy, cx, cy, width and height, beside colour_T_depth"
         )
     depth = dict(depth)
     inner = [depth.pop(key) for key in RIG_KEYS[1:] if key in depth]
@@ -304,7 +304,7 @@ def _rigid(place: str, rows: Any) -> np.ndarray:
     except (ValueError, TypeError, OverflowError):
         raise GavoError(f"{place}: must be four rows of four numbers") from None
     if not is_rigid(matrix, ROTATION_TOLERANCE):
-        raise GavoError(f"{place}: no rigid transform (a rotation and a shift, last row 0 0 0 1)")
+        raise GavoError(f"{place}: not a rigid transform (a rotation and a translation, last row 0 0 0 1)")
     if np.abs(matrix[:3, 3]).max() > LARGEST_SHIFT:
-        raise GavoError(f"{place}: a shift of more than {LARGEST_SHIFT:g} m: not in metres?")
+        raise GavoError(f"{place}: a translation of more than {LARGEST_SHIFT:g} m; is it in metres?")
     return rigid(matrix)

@@ -62,7 +62,7 @@ def sdk_distortion(whose: str, model: Any, coefficients: Any, table: Table) -> l
     if name not in LENSES:
         raise GavoError(f"{whose} lens model is {name[:60]}: not one of none, {', '.join(LENSES)}")
     if k.shape != (5,) or not np.all(np.isfinite([*k, table["fx"], table["fy"]])) or 0 in (table["fx"], table["fy"]):
-        raise GavoError(f"{whose} lens model needs a focal length that is not 0, and five finite coefficients")
+        raise GavoError(f"{whose} lens model needs a focal length other than 0, and five finite coefficients")
     u, v = np.meshgrid(np.linspace(0, table["width"] - 1, GRID), np.linspace(0, table["height"] - 1, GRID))
     (x, y), seen = LENSES[name]((u - table["cx"]) / table["fx"], (v - table["cy"]) / table["fy"], k)
     columns = [np.stack(_brown(x, y, unit)) - np.stack([x, y]) for unit in np.eye(5)]
@@ -85,7 +85,7 @@ def read_realsense(path: Path, values: Table) -> Table:
     told = rest_of_camera(str(path), {key: value for key, value in values.items() if not isinstance(value, str)})
     coefficients = told.pop("distortion", None) or [0.0] * 5
     if model == "none" and any(coefficients):
-        raise GavoError(f"{path}: coefficients of a lens, and no model of it: one of {', '.join(LENSES)}")
+        raise GavoError(f"{path}: lens coefficients without a lens model: expected one of {', '.join(LENSES)}")
     lens = sdk_distortion(f"{path}: the", model, coefficients, table)
     told.pop("model", None)
     return {**told, **table, **({"distortion": lens} if lens else {})}
@@ -113,7 +113,7 @@ def common_camera(place: str, cameras: list[Table]) -> Table:
     """
     moved = [key for key in FOCUS_KEYS if key in cameras[0]]
     rest = [{key: value for key, value in camera.items() if key not in moved} for camera in cameras]
-    fault = f"{place}: each frame has a camera of its own: write the one of most as a camera file"
+    fault = f"{place}: the frames have different cameras: write the most common one as a camera file"
     if any(camera != rest[0] for camera in rest) or any(key not in camera for key in moved for camera in cameras):
         raise GavoError(fault)
     try:
@@ -157,7 +157,9 @@ def read_nerfstudio(path: Path, values: Table) -> Table:
     if model == "OPENCV_FISHEYE":
         return {**table, **size, "model": "fisheye", "distortion": [values.get(f"k{i}", 0.0) for i in range(1, 5)]}
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE") or values.get("k4"):
-        raise GavoError(f"{path}: camera_model {shown(model)}, or its k4: OPENCV, OPENCV_FISHEYE and PINHOLE are read")
+        raise GavoError(
+            f"{path}: camera_model {shown(model)} or its k4 is not supported; OPENCV, OPENCV_FISHEYE and PINHOLE are"
+        )
     lens = [values.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
     return {**table, **size, **({"distortion": lens} if any(lens) else {})}
 
@@ -191,8 +193,8 @@ def read_openloris(path: Path, values: Table) -> Table:
     """Looks like the sensors of OpenLORIS-Scene."""
     camera = values[OPENLORIS_COLOR]
     if camera.get("model") != "pinhole":
-        raise GavoError(f"{path}: {OPENLORIS_COLOR}: model {shown(camera.get('model'))}: pinhole is the only one")
+        raise GavoError(f"{path}: {OPENLORIS_COLOR}: model {shown(camera.get('model'))}: only pinhole is supported")
     ((fx, cx, fy, cy),) = camera["intrinsics"]
     if abs(fx - fy) > MAX_FOCAL_DIFFERENCE * fx:
-        raise GavoError(f"{path}: {OPENLORIS_COLOR}: {fx:g} {cx:g} {fy:g} {cy:g}: hardly fx cx fy cy, in that order")
+        raise GavoError(f"{path}: {OPENLORIS_COLOR}: {fx:g} {cx:g} {fy:g} {cy:g} does not look like fx cx fy cy")
     return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **rest_of_camera(str(path), camera)}

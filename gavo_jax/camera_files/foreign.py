@@ -6,7 +6,7 @@ from pathlib import Path
 from gavo_jax.camera_files.words import FOCAL, LEAST_UNITS, REQUIRED, Table
 from gavo_jax.errors import GavoError
 
-ONE_FRAME = "what is said of a frame: leave --camera out where it lies beside the images, or write fx, fy, cx and cy"
+ONE_FRAME = "metadata of a frame: omit --camera if it is beside the images, or write fx, fy, cx and cy"
 
 BY_NAME: tuple[tuple[re.Pattern[str], str], ...] = (
     (
@@ -16,7 +16,7 @@ BY_NAME: tuple[tuple[re.Pattern[str], str], ...] = (
     ),
     (
         re.compile("CalibrationInformation"),
-        "Azure Kinect's raw calibration, in shares of its sensors: take the intrinsic.json that Open3D's "
+        "Azure Kinect's raw calibration, in fractions of its sensors: use the intrinsic.json that Open3D's "
         "azure_kinect_mkv_reader.py writes",
     ),
     (
@@ -25,7 +25,7 @@ BY_NAME: tuple[tuple[re.Pattern[str], str], ...] = (
         "which rs-enumerate-devices -c prints",
     ),
     (re.compile("cameraPoseARFrame|t_00|cam_K"), ONE_FRAME),
-    (re.compile(r"\d+|frame_\d+"), f"a camera for each frame: {ONE_FRAME}"),
+    (re.compile(r"\d+|frame_\d+"), f"one camera per frame: {ONE_FRAME}"),
     (
         re.compile(r"(?i).*(fov|aperture|angle|focal|sensor_?width).*"),
         "a lens or an angle of view in place of fx and fy: those are width / (2 tan(angle / 2)), or width * focal "
@@ -35,21 +35,21 @@ BY_NAME: tuple[tuple[re.Pattern[str], str], ...] = (
 """Names of entries, and what a file with such an entry is, in the order in which they are tried."""
 
 IN_TEXT: tuple[tuple[str, str], ...] = (
-    (r"(?i)\bppx\b", "of RealSense's: write width, height, fx, fy, ppx, ppy, model and coeffs into a .json"),
-    (r"^(P\d|P_rect_\d\d|K_\d\d):", "of KITTI's: write the first, sixth, third and seventh number of the images' P"),
-    (r"^\s*fx\s*:", "with names, call it .yaml"),
-    (r"^\s*fx\s*=", "with names, call it .toml"),
-    (r"^\s*fx\s+[-+\d]", "with names, put = behind each and call it .toml"),
+    (r"(?i)\bppx\b", "of RealSense: write width, height, fx, fy, ppx, ppy, model and coeffs into a .json"),
+    (r"^(P\d|P_rect_\d\d|K_\d\d):", "of KITTI: write the first, sixth, third and seventh number of the images' P"),
+    (r"^\s*fx\s*:", "if its values have names, rename it to .yaml"),
+    (r"^\s*fx\s*=", "if its values have names, rename it to .toml"),
+    (r"^\s*fx\s+[-+\d]", "if its values have names, put = behind each and rename it to .toml"),
 )
 """Patterns in a text of numbers that are not read, and what helps."""
 
 BY_ENDING = {
     ".npy": "write it as text: numpy.savetxt('camera.txt', numpy.load(FILE))",
     ".npz": "write its matrix as text: numpy.savetxt('camera.txt', …)",
-    ".conf": "a ZED's is for images that are not rectified, which its SDK does not export: write the left camera of "
+    ".conf": "a ZED's applies to unrectified images, which its SDK does not export: write the left camera of "
     "its calibration_parameters as .toml",
-    ".ini": "call it .toml, with one camera's fx = …, fy = …, cx = … and cy = … in it",
-    ".cfg": "call it .toml, or .txt where it is a matrix or a row of numbers",
+    ".ini": "rename it to .toml, with one camera's fx = …, fy = …, cx = … and cy = … in it",
+    ".cfg": "rename it to .toml, or to .txt if it is a matrix or a row of numbers",
     ".bin": "COLMAP's: write it as cameras.txt (colmap model_converter --output_type TXT)",
 }
 """What helps with files of other endings."""
@@ -108,6 +108,6 @@ def refuse_bop_camera(path: Path, values: Table) -> None:
     scale = values.get("depth_scale")
     if values.keys() == {*REQUIRED, "depth_scale"} and isinstance(scale, float) and LEAST_UNITS <= scale < 1:
         raise GavoError(
-            f"{path}: depth_scale: {scale:g}: less than a unit per metre: BOP's are millimetres per unit: write "
-            f"{1000 / scale:g}, of units per metre"
+            f"{path}: depth_scale: {scale:g}: less than one unit per metre; BOP's is in millimetres per unit: write "
+            f"{1000 / scale:g}, in units per metre"
         )

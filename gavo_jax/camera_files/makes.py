@@ -98,7 +98,7 @@ def _of_known_make(path: Path, values: Any) -> Table:
     if not isinstance(values, dict) or not values:
         raise GavoError(f"{path}: not a camera file: no `key: value` in it")
     if not all(isinstance(key, str) for key in values):
-        raise GavoError(f"{path}: not a camera file: a key that is no text")
+        raise GavoError(f"{path}: not a camera file: a key is not text")
     for is_of_make, read in MAKES:
         if is_of_make(values):
             try:
@@ -108,9 +108,7 @@ def _of_known_make(path: Path, values: Any) -> Table:
             except KeyError as error:
                 raise GavoError(f"{path}: {read.__doc__ or ''} Its entry {error} is missing") from None
             except (TypeError, ValueError, IndexError, AttributeError, OverflowError):
-                raise GavoError(
-                    f"{path}: {read.__doc__ or ''} Entries are missing, or an entry is of another kind"
-                ) from None
+                raise GavoError(f"{path}: {read.__doc__ or ''} Entries are missing, or have the wrong type") from None
     refuse_foreign(path, values)
     return values
 
@@ -130,7 +128,7 @@ def of_matrix(place: str, numbers: list[Any]) -> Table:
     fx, skew, cx, below, fy, cy, left, right, one = numbers
     if not any(isinstance(number, str) for number in numbers):
         if not any(numbers):
-            raise GavoError(f"{place}: the camera matrix is zero: nobody calibrated the camera: say --camera")
+            raise GavoError(f"{place}: the camera matrix is zero, as the camera was never calibrated: pass --camera")
         if not (cx or cy):
             skew, cx, below, cy, left, right = below, left, skew, right, cx, cy
         if below or left or right or one != 1 or abs(skew) > MOST_SKEW:
@@ -156,9 +154,7 @@ def _read_ros(path: Path, values: Table) -> Table:
     """Looks like a ROS camera_info."""
     region = values.get("roi")
     if isinstance(region, dict) and (region.get("x_offset") or region.get("y_offset")):
-        raise GavoError(
-            f"{path}: roi: begins within the image: write the numbers of what it cuts out, and leave it out"
-        )
+        raise GavoError(f"{path}: roi: starts inside the image: write the numbers of the cropped image, and omit roi")
     return {
         **of_matrix(str(path), numbers_of(first(values, MATRIX))),
         **rest_of_camera(str(path), values),
@@ -182,7 +178,7 @@ def _read_kalibr(path: Path, values: Table) -> Table:
 def _kalibr_camera(path: Path, values: Table) -> Table:
     """Looks like a camera of Kalibr or of EuRoC."""
     if values.get("camera_model", "pinhole") != "pinhole":
-        raise GavoError(f"{path}: camera_model {shown(values['camera_model'])}: pinhole is the only one that is read")
+        raise GavoError(f"{path}: camera_model {shown(values['camera_model'])}: only pinhole is supported")
     (fx, fy, cx, cy), (width, height) = values["intrinsics"], values["resolution"]
     size = {"width": width, "height": height}
     return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **size, **rest_of_camera(str(path), values)}
@@ -287,7 +283,7 @@ def _orb_model(kind: str) -> str:
 
 def _parse_xml(path: Path, text: str) -> Table:
     if "<opencv_storage" not in text[:1000]:
-        raise GavoError(f"{path}: not a camera file of OpenCV (<opencv_storage>)")
+        raise GavoError(f"{path}: not a camera file of OpenCV (no <opencv_storage>)")
     return _parse_storage(path, text)
 
 
@@ -300,7 +296,7 @@ def _parse_sens(path: Path, text: str) -> Table:
         matrix = np.array([float(value) for value in values[f"m_calibration{kind}Intrinsic"]]).reshape(4, 4)
         turned = [float(value) for value in values.get(f"m_calibration{kind}Extrinsic", identity)]
         if not np.allclose(turned, identity, atol=1e-6):
-            raise GavoError(f"{path}: m_calibration{kind}Extrinsic: not the identity, the only one that is read")
+            raise GavoError(f"{path}: m_calibration{kind}Extrinsic: must be the identity; others are not supported")
         size = {side.lower(): int(values[f"m_{kind.lower()}{side}"][0]) for side in ("Width", "Height")}
         return {**of_matrix(str(path), matrix[:3, :3].ravel().tolist()), **size}
 
@@ -310,7 +306,7 @@ def _parse_sens(path: Path, text: str) -> Table:
     except GavoError:
         raise
     except (KeyError, ValueError, IndexError) as error:
-        raise GavoError(f"{path}: looks like the info.txt of a scan, but is none: {line_of(error)}") from None
+        raise GavoError(f"{path}: looks like the info.txt of a scan, but is not one: {line_of(error)}") from None
     same = all(abs(color[key] - depth[key]) < SAME_CAMERA for key in color)
     return {**color, **scale} if same else {**color, **scale, "depth": depth}
 
@@ -344,7 +340,7 @@ def _parse_numbers(path: Path, text: str) -> Table:
         raise
     except ValueError:
         hint = hint_of_text(text)
-        raise GavoError(f"{path}: neither a matrix of 3x3 or 4x4 nor a row of fx fy cx cy{hint}") from None
+        raise GavoError(f"{path}: neither a 3x3 or 4x4 matrix nor a row of fx fy cx cy{hint}") from None
     return of_matrix(str(path), matrix[:3, :3].ravel().tolist())
 
 
@@ -361,7 +357,7 @@ def _check_order(path: Path, fx: float, fy: float, cx: float, cy: float) -> None
     is_wide = cx > fx * WIDEST_HALF or cy > abs(fy) * WIDEST_HALF
     is_turned = abs(cx - fx) < FOCAL_TOLERANCE * fx and abs(fy - fx) > 5 * FOCAL_TOLERANCE * fx  # fx cx fy cy
     if is_turned or is_wide or not FOCAL_RATIOS[0] * abs(fy) < fx < FOCAL_RATIOS[1] * abs(fy):
-        raise GavoError(f"{path}: {fx:g} {fy:g} {cx:g} {cy:g}: hardly fx fy cx cy, in that order")
+        raise GavoError(f"{path}: {fx:g} {fy:g} {cx:g} {cy:g} does not look like fx fy cx cy")
 
 
 PARSERS: dict[str, Callable[[Path, str], Table]] = {

@@ -66,7 +66,7 @@ def _matrix_of(node: Any) -> np.ndarray:
     numbers = [real_of(data.at(i)) for i in range(data.size())] if data.isSeq() else []
     rows, columns = (node.getNode(name) for name in ("rows", "cols"))
     if not (rows.isInt() and columns.isInt()) or int(rows.real()) * int(columns.real()) != len(numbers):
-        raise TypeError("a matrix whose rows and columns are not those of its data")
+        raise TypeError("the rows and columns of a matrix do not match its data")
     return np.array(numbers).reshape(int(rows.real()), int(columns.real()))
 
 

@@ -175,6 +175,6 @@ def _refuse_unknown(place: str, values: Table) -> None:
             is_told = True
         if is_told:
             raise GavoError(
-                f"{place}: {key[:60]!r}: not known, and looks like a lens or a unit of depth: "
-                "name it distortion_coefficients or depth_scale"
+                f"{place}: {key[:60]!r}: unknown, but looks like lens distortion or a unit of depth: "
+                "rename it to distortion_coefficients or depth_scale"
             )

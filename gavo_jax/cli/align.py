@@ -50,7 +50,7 @@ def align(options: Align) -> int:
         ]
         for depth, fault in faults:
             if fault:
-                raise GavoError(f"{depth}: {fault}, or go on with --force")
+                raise GavoError(f"{depth}: {fault}, or continue with --force")
     be_ready()
     with waiting("compiling and aligning …"):
         key = jax.random.key(options.seed)

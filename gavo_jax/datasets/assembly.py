@@ -95,7 +95,7 @@ def float_unit(samples: Iterable[DepthImage], calibration: Calibration, given: f
         [image.name for image, own in zip(samples, kinds, strict=True) if own is kind] for kind in (False, True)
     )
     if whole and floats and given is None:
-        raise GavoError(f"{whole[0]}: depth in whole numbers, and in floats in {floats[0]}: say --depth-scale, of both")
+        raise GavoError(f"{whole[0]}: depth in whole numbers, but floats in {floats[0]}: pass --depth-scale for both")
     readings = np.concatenate([image[image > 0] for image in clean]) if clean else np.empty(0)
     file = given or _likely_unit(readings, calibration, samples[0].name if samples else "")
     far = float(np.percentile(readings, 99)) / file if readings.size else 0.0
@@ -119,13 +119,13 @@ def _likely_unit(readings: Float[np.ndarray, " n"], calibration: Calibration, na
     is_stated, median = _states_unit(calibration), float(np.median(readings)) if readings.size else METRES
     if not is_stated and readings.size and Z_BUFFER < readings.min() < readings.max() <= 1:
         raise GavoError(
-            f"{name}: depth of {readings.min():.3g} to {readings.max():.3g}: a z-buffer, it seems, which counts no "
-            "distance: write near far / (far - (far - near) depth); say --depth-scale 1 if it is in metres"
+            f"{name}: depth of {readings.min():.3g} to {readings.max():.3g} looks like a z-buffer, not a distance: "
+            "write near far / (far - (far - near) depth), or pass --depth-scale 1 if it is in metres"
         )
     if not is_stated and readings.size and readings.min() < readings.max() == 1:
         raise GavoError(
-            f"{name}: depth of exactly 1 at most: scaled to its farthest reading: say --depth-scale, units "
-            "per metre: 0.1 where 1 stands for 10 m"
+            f"{name}: the largest depth is exactly 1, as if scaled to the farthest reading: pass --depth-scale, in "
+            "units per metre (0.1 if 1 stands for 10 m)"
         )
     if is_stated and _is_within(median / calibration.color.depth_scale, STATED_MEDIANS):
         return calibration.color.depth_scale
@@ -133,7 +133,8 @@ def _likely_unit(readings: Float[np.ndarray, " n"], calibration: Calibration, na
         if _is_within(median, medians):
             return unit
     raise GavoError(
-        f"{name}: depth of median {median:g}, in neither metres nor millimetres: say --depth-scale, units per metre"
+        f"{name}: a median depth of {median:g} fits neither metres nor millimetres: pass --depth-scale, "
+        "in units per metre"
     )
 
 
@@ -205,8 +206,8 @@ class FrameAssembler:
             depth_timestamp = stamped + self.calibration.depth_delay
         _check_size(bgr, self.calibration.color, name, "camera")
         if bgr.dtype != np.uint8 and np.mean(bgr > self.white) > MAX_EXCESS_SHARE:
-            brighter = "is brighter than the images that were looked at first"
-            self._tell_once(brighter, name, f"what exceeds {self.white} is white, in others too")
+            brighter = "is brighter than the images that were sampled"
+            self._tell_once(brighter, name, f"values above {self.white} become white, in other images too")
         image = _binned(to_8_bits(bgr, self.white), self.binning)
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if self.color else None
@@ -230,14 +231,14 @@ class FrameAssembler:
         if of_floats is not None and of_floats != is_float and _is_of_floats(depth.raw) is is_float:
             kinds = ("whole numbers", "floats")
             raise FrameError(
-                f"{depth.name}: depth in {kinds[is_float]}, and in {kinds[of_floats]} in the images that were "
-                "looked at first: say --depth-scale, of both"
+                f"{depth.name}: depth in {kinds[is_float]}, but in {kinds[of_floats]} in the images that were "
+                "sampled: pass --depth-scale for both"
             )
         if depth.raw.dtype != np.uint16:
             farthest = NO_READING / self.unit.frame
             if np.mean(np.isfinite(depth.raw) & (depth.raw > farthest * self.unit.file)) > MAX_EXCESS_SHARE:
-                so = f"depth beyond {farthest:.3g} m is left out, of others too"
-                self._tell_once("reaches further than frames of this source hold", depth.name, so)
+                so = f"depth beyond {farthest:.3g} m is left out, in other images too"
+                self._tell_once("reaches further than frames of this source can store", depth.name, so)
         return in_frame_units(depth.raw, self.unit)
 
     def _tell_once(self, what: str, name: str, so: str) -> None:
@@ -287,12 +288,10 @@ def _check_registered(depth: DepthImage, camera: Camera) -> None:
     if (width, height) != (camera.width, camera.height):
         needed = "to register it, the camera file needs the depth camera (a table [depth]) and colour_T_depth"
         if width * camera.height == height * camera.width:
-            needed += (
-                f"; where it is only of another size, [depth] has colour's numbers times {width / camera.width:.6g}"
-            )
+            needed += f"; if it differs only in size, [depth] has colour's numbers times {width / camera.width:.6g}"
         raise FrameError(
-            f"{depth.name}: is {width}x{height} pixels, the colour camera's images are {camera.width}x{camera.height}: "
-            f"{needed}"
+            f"{depth.name}: is {width}x{height} pixels, but the colour camera's images are "
+            f"{camera.width}x{camera.height}: {needed}"
         )
 
 
@@ -300,4 +299,4 @@ def _check_size(image: np.ndarray, camera: Camera, name: str, whose: str) -> Non
     height, width = image.shape[:2]
     if (width, height) != (camera.width, camera.height):
         expected = f"the {whose}'s images are {camera.width}x{camera.height}"
-        raise FrameError(f"{name}: is {width}x{height} pixels, {expected}: say --camera with a camera of that size")
+        raise FrameError(f"{name}: is {width}x{height} pixels, but {expected}: pass --camera with one of that size")

@@ -18,7 +18,7 @@ class FrameError(GavoError):
     """A single frame cannot be read; the rest of the sequence may be fine."""
 
 
-TRACED = "gavo_jax looks at its numbers on the host: call it outside jax.jit, jax.vmap and jax.grad"
+TRACED = "gavo_jax needs concrete numbers on the host: call it outside jax.jit, jax.vmap and jax.grad"
 
 
 def require_image(name: str, image: Any, size: tuple[int, ...]) -> None:
@@ -31,8 +31,8 @@ def require_image(name: str, image: Any, size: tuple[int, ...]) -> None:
         raise FrameError(TRACED)
     kind = image.dtype if hasattr(image, "dtype") else np.asarray(image).dtype
     if np.shape(image) != size or not is_real(kind):
-        helps = "; frame_of makes a Frame of a colour image" if name == "grey" and np.ndim(image) == 3 else ""
-        fault = f"{name} image is {kind} of shape {np.shape(image)}: numbers of shape {size} are needed"
+        helps = "; frame_of makes a Frame from a colour image" if name == "grey" and np.ndim(image) == 3 else ""
+        fault = f"{name} image is {kind} of shape {np.shape(image)}: expected numbers of shape {size}"
         raise FrameError(fault + helps)
 
 
@@ -55,11 +55,11 @@ def require_grey_levels(grey: Any) -> None:
         return
     least, most = float(np.min(values)), float(np.max(values))
     if least < 0.0 and -least > 0.5 * most:
-        raise FrameError(f"grey levels reach from 0 to 255, not from {least:g}: add what was taken from them")
+        raise FrameError(f"grey levels must range from 0 to 255, not from {least:g}: add what was subtracted")
     if not np.issubdtype(values.dtype, np.integer) and 0.0 < most <= 1.0:
-        raise FrameError("grey levels reach from 0 to 255, not from 0 to 1: multiply by 255")
+        raise FrameError("grey levels must range from 0 to 255, not from 0 to 1: multiply by 255")
     if most > BRIGHTEST:
-        raise FrameError(f"grey levels reach from 0 to 255, not to {most:g}: scale the image")
+        raise FrameError(f"grey levels must range from 0 to 255, not to {most:g}: scale the image")
 
 
 def as_seconds(name: str, stamp: Any) -> float:
@@ -68,7 +68,7 @@ def as_seconds(name: str, stamp: Any) -> float:
     Raises:
         GavoError: It is not a single number but, say, text or a date.
     """
-    return as_number(name, stamp, "seconds are needed, a number")
+    return as_number(name, stamp, "expected seconds as a number")
 
 
 def index_at(timestamps: Float[np.ndarray, " n"], stamp: float) -> int:
@@ -89,7 +89,7 @@ def require_begin_in_seconds(stamp: float) -> None:
         FrameError: It exceeds `LATEST`: as seconds it would be thousands of years.
     """
     if LATEST < abs(stamp) < np.inf:
-        raise FrameError(f"timestamp: seconds are needed, and {stamp:.0f} of them are {stamp / YEAR:.0f} years")
+        raise FrameError(f"timestamp: expected seconds, but {stamp:.0f} of them are {stamp / YEAR:.0f} years")
 
 
 class TimestampError(FrameError):
@@ -164,10 +164,10 @@ def require_sequence(sequence: Any, needed: tuple[str, ...] = TRACKED) -> None:
     kind = type(sequence).__name__
     lacking = [name for name in needed if not hasattr(sequence, name)]
     if isinstance(sequence, type) or "camera" in lacking:
-        fault = f"a Sequence is needed, not {kind}"
-        raise GavoError(fault + ": gavo.open_source(path), or Odometry.register frame by frame")
+        fault = f"expected a Sequence, got {kind}"
+        raise GavoError(fault + ": use gavo.open_source(path), or Odometry.register frame by frame")
     if lacking:
-        raise GavoError(f"{kind} is no Sequence: it has no {', '.join(lacking)}")
+        raise GavoError(f"{kind} is not a Sequence: it has no {', '.join(lacking)}")
 
 
 class Sequence(Protocol):
@@ -230,6 +230,6 @@ def require_parts(sequence: Sequence) -> None:
     require_camera(sequence.camera)
     if np.shape(sequence.timestamps) != (len(sequence),):
         shape = np.shape(sequence.timestamps)
-        raise GavoError(f"{kind}: timestamps: one for each of {len(sequence)} frames is needed, not shape {shape}")
+        raise GavoError(f"{kind}: timestamps: expected one for each of {len(sequence)} frames, got shape {shape}")
     if not isinstance(truth, Trajectory | None):
-        raise GavoError(f"{kind}: ground_truth: a Trajectory or None is needed, not {type(truth).__name__}")
+        raise GavoError(f"{kind}: ground_truth: expected a Trajectory or None, got {type(truth).__name__}")

@@ -118,7 +118,7 @@ def told_stamp(place: str, stamp: Any) -> float:
     """
     is_number = isinstance(stamp, int | float) and not isinstance(stamp, bool)
     if not (is_number and abs(stamp) < LATEST):  # NaN isn't less either
-        raise GavoError(f"{place}: timestamp: expected seconds, found {shown(stamp)}: say --rate to do without them")
+        raise GavoError(f"{place}: timestamp: expected seconds, found {shown(stamp)}: pass --rate to ignore timestamps")
     return stamp
 
 

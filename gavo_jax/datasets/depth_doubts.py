@@ -73,16 +73,16 @@ def _fault_of_numbers(images: Sequence[UInt16[np.ndarray, "h w"]]) -> str | None
     for factor in STRETCHES:
         if len(values) >= DISTINCT and not (values % factor).any():
             return (
-                f"every number is a multiple of {factor}: 8 bits stretched to 16, of a picture of depth: write depth "
+                f"every number is a multiple of {factor}: an 8-bit picture of depth, stretched to 16 bits: write depth "
                 "itself as 16 bits or floats"
             )
     if values[-1] == RAW_KINECT and np.mean(readings == RAW_KINECT) > MUCH and all(image.all() for image in images):
-        return f"{RAW_KINECT} in place of no reading: the raw disparity of a Kinect: write its depth in millimetres"
+        return f"{RAW_KINECT} for missing readings: the raw disparity of a Kinect: write its depth in millimetres"
     as_stored, swapped = _mean_step(images), _mean_step([image.byteswap() for image in images])
     if as_stored > SWAPPED * swapped > 0:
         return (
             f"neighbouring pixels differ by {as_stored:.0f}, and by {swapped:.0f} once both bytes of each number are "
-            "swapped: written in the wrong order of bytes: swap them (NumPy's byteswap)"
+            "swapped: written in the wrong byte order: swap them (NumPy's byteswap)"
         )
     return None
 
@@ -136,8 +136,8 @@ def _inverse(sequence: FrameSequence) -> str | None:
     if straight < PLANES or opposite > MOST_OTHERS * straight:
         return None
     return (
-        f"{straight} flat patches are flat in these numbers, and {opposite} in their inverse, where those of depth "
-        "are: disparity or inverse depth, it seems, as MiDaS estimates it: write depth"
+        f"{straight} patches are flat in these numbers, and {opposite} in their inverse, in which planes are flat: this looks "
+        "like disparity or inverse depth, as MiDaS estimates it: write depth"
     )
 
 

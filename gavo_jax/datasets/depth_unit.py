@@ -152,7 +152,7 @@ def fault_of_scale(sequence: FrameSequence) -> str | None:
     if better is not None:
         return (
             f"depth with depth_scale {scale:g} has a median of {sample.median / scale:.3g} m: it looks like "
-            f"{name_of_unit(better)}: set --depth-scale {better:g}"
+            f"{name_of_unit(better)}; set --depth-scale {better:g}"
         )
     median, in_other = sample.median / scale, _in_another_unit(sample, scale)
     is_guess = sample.is_whole and getattr(sequence, "unit_is_assumed", False)
@@ -190,14 +190,14 @@ def _as_halves(sample: DepthSample) -> str:
     if not (sample.is_whole and HALVES[0] <= sample.near and sample.far <= HALVES[1]):
         return ""
     metres = float(np.uint16(sample.median).view(np.float16))
-    return f"; as bits of floats, which Mid-Air keeps in PNG, it is {metres:.3g}: write those as TIFF or .npy of floats"
+    return f"; as bits of floats, as in PNG of Mid-Air, it is {metres:.3g}: write those as TIFF or .npy of floats"
 
 
 def _as_shares(sample: DepthSample, scale: float) -> str:
     """What depth is if floats are shares of a greatest distance, as simulators have it; empty where they cannot be."""
     if sample.is_whole or sample.far > 1 or scale != 1:
         return ""
-    return "; floats up to 1 may be shares of a greatest distance: say --depth-scale 0.1 where 1 stands for 10 m"
+    return "; floats up to 1 may be fractions of a largest distance: pass --depth-scale 0.1 if 1 stands for 10 m"
 
 
 def lack_of_depth(sequence: FrameSequence) -> str | None:
@@ -215,12 +215,12 @@ def lack_of_depth(sequence: FrameSequence) -> str | None:
             continue
     if recorded:
         return (
-            f"of the depth of the {looked} frames that were looked at no reading falls into the colour image: is "
-            "colour_T_depth turned round, or not in metres?"
+            f"no depth reading of the {looked} frames sampled falls into the colour image; check that "
+            "colour_T_depth is not inverted, and in metres"
         )
     if not looked:
         return None
-    return f"no reading in the depth of the {looked} frames that were looked at: 0, 65535, negative and NaN are none"
+    return f"no depth readings in the {looked} frames sampled; check for values other than 0, 65535, negative and NaN"
 
 
 def reader_of(sequence: FrameSequence) -> Callable[[int], np.ndarray]:
@@ -254,8 +254,8 @@ def sample_sequence(sequence: FrameSequence) -> tuple[DepthSample | None, float]
 NAMES = {
     1.0: "metres",
     1000.0: "millimetres",
-    5000.0: "the TUM benchmark's 5000 to a metre",
-    SHIFTED: "SUN3D's 8000 to a metre",
+    5000.0: "the TUM benchmark's 5000 per metre",
+    SHIFTED: "SUN3D's 8000 per metre",
     TENTHS: "tenths of a millimetre",
     CENTIMETRES: "centimetres",
 }
@@ -264,4 +264,4 @@ NAMES = {
 
 def name_of_unit(scale: float) -> str:
     """The name of a unit for messages."""
-    return NAMES.get(scale, f"{scale:g} to a metre")
+    return NAMES.get(scale, f"{scale:g} per metre")

@@ -51,7 +51,7 @@ def folder_of(name: str) -> str:
     short = re.sub(r"^(rgbd_dataset_)?freiburg", "fr", name.strip())
     if short not in known:
         near = difflib.get_close_matches(short, known, n=1, cutoff=0.0)[0]
-        raise GavoError(f"{name!r}: no sequence of the TUM RGB-D benchmark; did you mean {near!r}?")
+        raise GavoError(f"{name!r}: not a sequence of the TUM RGB-D benchmark; did you mean {near!r}?")
     return f"rgbd_dataset_freiburg{short[2:]}"
 
 
@@ -111,7 +111,7 @@ def _retrieve(url: str, to: Path, progress: Progress) -> Path:
     except GavoError:
         raise
     except (requests.RequestException, ValueError) as error:
-        kept = f"; {partial} keeps what came, a second call goes on from there" if partial.exists() else ""
+        kept = f"; {partial} keeps what was received; another call resumes from there" if partial.exists() else ""
         raise GavoError(_told(error, url, kept)) from None
 
 
@@ -128,7 +128,7 @@ def _told(error: Exception, url: str, kept: str) -> str:
         case requests.ConnectionError():
             return f"{url}: no connection (is there a network?){kept}"
         case requests.RequestException():
-            return f"{url}: broke off {ATTEMPTS} times: {words}{kept}"
+            return f"{url}: the download broke off {ATTEMPTS} times: {words}{kept}"
         case _:
             return f"{url[:200]}: not an address to download from: {words}"
 
@@ -158,13 +158,13 @@ def _fetch(url: str, partial: Path, progress: Progress) -> None:
     with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT) as response:
         if response.status_code == requests.codes.requested_range_not_satisfiable:
             partial.unlink()
-            raise requests.ConnectionError("what was there is no part of the server's file")
+            raise requests.ConnectionError("the partial file does not match the server's file")
         response.raise_for_status()
         span = re.fullmatch(rf"bytes ({SIZE})-{SIZE}/({SIZE}|\*)", response.headers.get("Content-Range", ""))
         goes_on = response.status_code == requests.codes.partial_content and span is not None
         if goes_on and span is not None and int(span[1]) != have:
             partial.unlink(missing_ok=True)
-            raise requests.ConnectionError("the server goes on at another place")
+            raise requests.ConnectionError("the server resumed at the wrong position")
         if not goes_on:
             have = 0
         length = response.headers.get("Content-Length", "")
@@ -175,7 +175,7 @@ def _fetch(url: str, partial: Path, progress: Progress) -> None:
                 have += len(chunk)
                 progress(have, total)
     if total is not None and have != total:
-        raise requests.ConnectionError(f"{have} of {total} bytes came")
+        raise requests.ConnectionError(f"received {have} of {total} bytes")
 
 
 def _unpack(archive: Path, target: Path) -> None:
@@ -191,11 +191,11 @@ def _unpack(archive: Path, target: Path) -> None:
             while stream.read(CHUNK):  # up to the checksum at its end
                 pass
         if not (scratch / target.name / "rgb.txt").is_file():
-            raise tarfile.ReadError(f"holds no {target.name}/rgb.txt")
+            raise tarfile.ReadError(f"contains no {target.name}/rgb.txt")
         os.replace(scratch / target.name, target)
     except (*DAMAGED, FileExistsError, IsADirectoryError, NotADirectoryError) as error:
         archive.unlink()
-        raise GavoError(f"{archive}: removed, a damaged or unsafe archive: {line_of(error)}") from None
+        raise GavoError(f"{archive}: damaged or unsafe archive, now removed: {line_of(error)}") from None
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 

@@ -370,6 +370,6 @@ def open_pair(
     """
     for color, depth in images:
         if Path(color) == Path(depth):
-            raise GavoError(f"{color}: given as colour and as depth alike")
+            raise GavoError(f"{color}: given as both colour and depth")
     entries = [Entry(0.0, Path(color), Path(depth)) for color, depth in images]
     return FileSequence("pair", entries, calibration, reading=reading)

@@ -72,7 +72,7 @@ def read_frame(place: Path) -> UInt8[np.ndarray, "h w 3"]:
         except GavoError as error:
             raise FrameError(str(error)) from None
     if image is None:
-        raise FrameError(f"{film}: frame {int(place.name)}: the film cannot be decoded as far as that")
+        raise FrameError(f"{film}: frame {int(place.name)}: the film cannot be decoded that far")
     return image
 
 
@@ -112,7 +112,7 @@ class _Film:
         with without_log():
             self._capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
         if not self._capture.isOpened():
-            raise GavoError(f"{self._path}: no film that can be decoded: write its frames as images")
+            raise GavoError(f"{self._path}: the film cannot be decoded: write its frames as images")
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         self._next = 0
 

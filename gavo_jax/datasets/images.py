@@ -112,7 +112,7 @@ def decode_depth(data: bytes, name: str) -> Depth:
         found = _describe(image)
         if image.dtype == np.uint8:
             several = (
-                " or numbers packed into channels, as CARLA's: write those" if image.ndim == 3 else ": write depth"
+                " or numbers packed into channels, as in CARLA: write those" if image.ndim == 3 else ": write depth"
             )
             found += f", a picture of depth{several} as 16 bits or floats"
         raise FrameError(f"{name}: not a depth image: expected one channel of 16 bits or of floats, found {found}")
@@ -172,7 +172,7 @@ def read_bytes(path: Path) -> bytes:
         if path.exists() and not path.is_file():
             raise FrameError(f"{path}: not a file")
         if path.stat().st_size > MAX_BYTES:
-            raise FrameError(f"{path}: larger than {MAX_BYTES} bytes: no image of up to {MAX_SIDE} pixels a side")
+            raise FrameError(f"{path}: larger than {MAX_BYTES} bytes, the limit for up to {MAX_SIDE} pixels a side")
         return path.read_bytes()
     except FileNotFoundError:
         raise FrameError(f"{path}: no such file") from None
@@ -184,20 +184,20 @@ def read_bytes(path: Path) -> bytes:
 
 def _decode(data: bytes, name: str, flags: int) -> np.ndarray:
     if not data:
-        raise FrameError(f"{name}: empty file: get it anew")
+        raise FrameError(f"{name}: empty file: download or copy it again")
     if data.startswith(PNG_SIGNATURE):
         _check_png(data, name)
     elif not _is_known(data):
         other = next((words for begin, words in IN_PLACE if data.lstrip().lower().startswith(begin)), None)
         raise FrameError(
-            f"{name}: {other or f'no image that OpenCV decodes (begins with {data[:8]!r}): convert it to PNG'}"
+            f"{name}: {other or f'not an image that OpenCV can decode (begins with {data[:8]!r}): convert it to PNG'}"
         )
     data = PFM_SCALE.sub(rb"\g<1>1", data, 1) if data.startswith((b"Pf", b"PF")) else _unturned(data, name)
     image = _decoded(data, flags, name)
     if image is None and flags == AS_COLOR:
         image = _decoded(data, AS_STORED, name)  # an intact image that is not colour: the caller says so
     if image is None:
-        raise FrameError(f"{name}: torn or damaged image: get the file anew")
+        raise FrameError(f"{name}: truncated or damaged image: download or copy it again")
     if max(image.shape[:2]) > MAX_SIDE:
         height, width = image.shape[:2]
         raise FrameError(f"{name}: is {width}x{height} pixels: more than {MAX_SIDE} a side")
@@ -225,7 +225,7 @@ def _unturned(data: bytes, name: str) -> bytes:
             if tag == TIFF_ORIENTATION:
                 data = data[: at + 8] + struct.pack(f"{order}H", 1) + data[at + 10 :]
     if tags.get(TIFF_NUMBERS) == 3 and tags.get(TIFF_BITS) == 16:
-        raise FrameError(f"{name}: a TIFF of floats of 16 bits, which OpenCV does not decode: write 32 bits, or .npy")
+        raise FrameError(f"{name}: a TIFF of 16-bit floats, which OpenCV does not decode: write 32 bits, or .npy")
     return data
 
 
@@ -241,7 +241,7 @@ def _decoded(data: bytes, flags: int, name: str) -> np.ndarray | None:
         except (cv2.error, MemoryError):
             image = None
     if any(map(JPEG_LOSS.search, said)):
-        raise FrameError(f"{name}: damaged JPEG image, of which a part is lost: get the file anew")
+        raise FrameError(f"{name}: damaged JPEG image, part of which is lost: download or copy it again")
     return image
 
 
@@ -263,10 +263,10 @@ SIGNATURES = (
 """First bytes of the formats that OpenCV decodes."""
 
 
-WEB_PAGE = "a web page in place of an image: get the file anew"
+WEB_PAGE = "a web page instead of an image: download or copy the file again"
 
 IN_PLACE = (
-    (b"version https://git-lfs", "a pointer of Git LFS in place of the image: fetch that (git lfs pull)"),
+    (b"version https://git-lfs", "a Git LFS pointer instead of the image: fetch it (git lfs pull)"),
     (b"<!doctype", WEB_PAGE),
     (b"<html", WEB_PAGE),
 )
@@ -287,7 +287,7 @@ def _check_png(data: bytes, name: str) -> None:
         if end + 4 > len(data):
             break
         if zlib.crc32(memoryview(data)[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            raise FrameError(f"{name}: damaged PNG image (checksum): get the file anew")
+            raise FrameError(f"{name}: damaged PNG image (checksum): download or copy it again")
         if at == len(PNG_SIGNATURE):
             if kind != b"IHDR" or length != 13:
                 break
@@ -297,7 +297,7 @@ def _check_png(data: bytes, name: str) -> None:
         if kind == b"IEND":
             return
         at = end + 4
-    raise FrameError(f"{name}: torn PNG image (no end): get the file anew")
+    raise FrameError(f"{name}: truncated PNG image (no end): download or copy it again")
 
 
 def _decode_npy(data: bytes, name: str) -> np.ndarray:
@@ -321,14 +321,14 @@ def _decode_npz(data: bytes, name: str) -> np.ndarray:
         chosen = named or archive.infolist()
         if len(chosen) != 1:
             found = ", ".join(entry.filename for entry in chosen)[:100] or "none"
-            raise FrameError(f"{name}: of several arrays one has to be named depth: found {found}")
+            raise FrameError(f"{name}: one of several arrays has to be named depth: found {found}")
         if chosen[0].file_size > MAX_BYTES:
-            raise FrameError(f"{name}: larger than {MAX_BYTES} bytes: no image of up to {MAX_SIDE} pixels a side")
+            raise FrameError(f"{name}: larger than {MAX_BYTES} bytes, the limit for up to {MAX_SIDE} pixels a side")
         content = archive.read(chosen[0])
     except FrameError:
         raise
     except Exception:  # of many types, depending on the compression
-        raise FrameError(f"{name}: torn or damaged archive of NumPy arrays: get the file anew") from None
+        raise FrameError(f"{name}: truncated or damaged archive of NumPy arrays: download or copy it again") from None
     return _decode_npy(content, name)
 
 
@@ -344,7 +344,7 @@ def _decode_exr(data: bytes, name: str) -> np.ndarray:
         import OpenEXR  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise FrameError(
-            f"{name}: OpenEXR images need the extra [exr] (pip install 'gavo-jax[exr]'), or TIFF or .npy instead"
+            f"{name}: OpenEXR images need the extra [exr] (pip install 'gavo-jax[exr]'); or use TIFF or .npy"
         ) from None
     with tempfile.NamedTemporaryFile(suffix=".exr") as file:  # the library only reads files
         file.write(data)
@@ -353,7 +353,7 @@ def _decode_exr(data: bytes, name: str) -> np.ndarray:
             with without_words_on(file.name):
                 channels = OpenEXR.File(file.name).channels()
         except Exception:  # of several undocumented types, with messages about internals
-            raise FrameError(f"{name}: torn or damaged OpenEXR image: get the file anew") from None
+            raise FrameError(f"{name}: truncated or damaged OpenEXR image: download or copy it again") from None
     return _depth_channel(channels, name)
 
 
@@ -364,10 +364,10 @@ def _depth_channel(channels: Mapping[str, Any], name: str) -> np.ndarray:
     chosen = named or list(channels)
     if len(chosen) != 1:
         found = ", ".join(chosen)[:100] or "none"
-        raise FrameError(f"{name}: of the channels of this OpenEXR image one has to be depth, named Z: found {found}")
+        raise FrameError(f"{name}: one channel of this OpenEXR image has to be depth, named Z: found {found}")
     pixels = np.asarray(channels[chosen[0]].pixels)
     if pixels.ndim == 3 and not _is_grey(pixels):
-        raise FrameError(f"{name}: an OpenEXR image of colour ({chosen[0]}), and no channel of depth, named Z")
+        raise FrameError(f"{name}: a colour OpenEXR image ({chosen[0]}) without a depth channel named Z")
     return pixels[..., 0] if pixels.ndim == 3 else pixels
 
 

@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import NamedTuple
 
-ARRAYS = "write its colour and depth as images into rgb/ and depth/, or as .npy of one frame each"
+ARRAYS = "write its colour and depth as images into rgb/ and depth/, or as one .npy per frame"
 
-RECORD_3D = "a recording of Record3D: export it in the app as EXR + RGB, and name the folder of rgb/ and depth/"
+RECORD_3D = "a Record3D recording: export it in the app as EXR + RGB, and pass the folder with rgb/ and depth/"
 
 AS_DEPTH = "as z = length / sqrt(1 + x^2 + y^2)"
 
@@ -22,30 +22,30 @@ class Known(NamedTuple):
 KNOWN = (
     Known(
         ("d-*.pgm", "r-*.ppm"),
-        "the raw recording of NYU Depth, whose depth is in units of disparity: write rgb/ and depth/ with the "
+        "a raw recording of NYU Depth, whose depth is in units of disparity: write rgb/ and depth/ with the "
         "dataset's toolbox first",
     ),
     Known(
         ("data.jsonl", "calibration.json"),
-        "a recording of Spectacular AI: write its images with sai-cli process, and name the folder of transforms.json",
+        "a Spectacular AI recording: extract its images with sai-cli process, and pass the folder of transforms.json",
     ),
     Known(
         ("depth.bin", "pose_intrinsic_imu.json"),
-        "the iPhone's part of a scan of ScanNet++, its images still packed: write rgb/ and depth/ with "
+        "the iPhone's part of a ScanNet++ scan, its images still packed: write rgb/ and depth/ with "
         "iphone/prepare_iphone_data.py of its toolbox (extract_rgb, extract_depth)",
     ),
     Known(
         ("color_left/trajectory_*",),
-        "recordings of Mid-Air, whose PNG hold floats of 16 bits: of a trajectory write depth = 512 / disparity of "
+        "recordings of Mid-Air, whose PNG contain 16-bit floats: for a trajectory, write depth = 512 / disparity from "
         "stereo_disparity/ as TIFF or .npy of floats into depth/, beside rgb/ with the images of color_left/",
     ),
-    Known(("rgbd/", "metadata"), f"unzipped, {RECORD_3D}"),
-    Known(("meta/info.json", "data/"), f"a dataset of LeRobot, of films and tables: of one episode {ARRAYS}"),
+    Known(("rgbd/", "metadata"), f"the contents of {RECORD_3D}"),
+    Known(("meta/info.json", "data/"), f"a LeRobot dataset of films and tables: for one episode, {ARRAYS}"),
     *(
         Known(
             (f"{inside}*_geometry_hdf5/",),
-            "a scene of Hypersim, in HDF5: of one camera write color as images into rgb/, and depth_meters, which are "
-            f"lengths of rays, {AS_DEPTH} into depth/ (h5py)",
+            "a Hypersim scene in HDF5: for one camera, write color as images into rgb/, and depth_meters, which are "
+            f"ray lengths, {AS_DEPTH} into depth/ (h5py)",
         )
         for inside in ("", "images/")
     ),
@@ -56,31 +56,32 @@ KNOWN = (
     ),
     Known(
         ("groundtruth_depth/", "velodyne_raw/"),
-        "single images of KITTI's depth completion: a drive is needed, whose frames follow each other",
+        "single images of KITTI's depth completion: expected a drive, with consecutive frames",
     ),
     *(
         Known(
             (f"{name}_color_images/", f"{name}_depth_images/"),
-            "photographs of Matterport3D, which turns by 60 degrees from one to the next: a film is needed, as Habitat "
-            "renders one of its rooms",
+            "photographs of Matterport3D, 60 degrees apart: expected consecutive frames, such as Habitat "
+            "renders of its rooms",
         )
         for name in ("matterport", "undistorted")
     ),
     *(
         Known(
             (f"Depth {mode}*",),
-            "a recording of HoloLens 2: write its images with save_pclouds.py of HoloLens2ForCV (StreamRecorder), and "
-            "name the folder pinhole_projection",
+            "a HoloLens 2 recording: extract its images with save_pclouds.py of HoloLens2ForCV (StreamRecorder), and "
+            "pass the folder pinhole_projection",
         )
         for mode in ("Long Throw", "AHaT")
     ),
     *(
-        Known((f"{inside}depth*.dpt",), "LINEMOD as first published: take it as BOP has it, which is read")
+        Known((f"{inside}depth*.dpt",), "LINEMOD as first published: use its BOP version, which is read")
         for inside in ("", "data/")
     ),
     Known(
         ("stereo/depth_maps/",),
-        "depth of COLMAP's stereo, whose unit is unknown and whose images are no film: an RGB-D camera's is needed",
+        "depth maps of COLMAP's stereo, whose unit is unknown and whose images are not consecutive: expected those of "
+        "an RGB-D camera",
     ),
 )
 """Known kinds of folders; the first whose patterns fit is told."""

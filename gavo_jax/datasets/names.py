@@ -70,7 +70,7 @@ class Found(NamedTuple):
 
     def unpaired(self, frames: int) -> list[str]:
         """Describe the images that are in no frame, one line per kind."""
-        return unpaired((len(self.color), len(self.depth)), frames, "of the same number") + nameless(self.others)
+        return unpaired((len(self.color), len(self.depth)), frames, "with the same number") + nameless(self.others)
 
 
 def unpaired(images: tuple[int, int], frames: int, why: str) -> list[str]:
@@ -84,7 +84,7 @@ def unpaired(images: tuple[int, int], frames: int, why: str) -> list[str]:
 
 def nameless(images: Sequence[Path]) -> list[str]:
     """Describe images without a number in their names, in one line if there are any."""
-    return [f"{len(images)} images: no number in their names, as {images[0].name}"] if images else []
+    return [f"{len(images)} images: no number in their names, such as {images[0].name}"] if images else []
 
 
 def images_among(files: Iterable[Path], suffixes: Sequence[str]) -> list[Path]:
@@ -106,7 +106,7 @@ def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
     found = [Found(_at(place, both[0]), _at(place, both[1]), others) for place in places]
     usable = [one for one in found if all(map(_is_in_order, one[:2], both))]
     if found and not usable:
-        odd = f"{both[0][0]}: more than one number of the names changes: leave one, or say the frames' stamps"
+        odd = f"{both[0][0]}: more than one number in the names varies: keep one, or use timestamps as names"
         raise GavoError(next(filter(None, map(_fault, both)), odd))
     chosen = max(usable, key=lambda one: len(one.color.keys() & one.depth.keys()), default=Found({}, {}, others))
     _check_start(chosen)
@@ -128,8 +128,8 @@ def _check_start(found: Found) -> None:
     are_of_two_rates = a == c and any(abs(many - few * rate) <= rate for rate in RATES)
     if are_whole and (a != c and b != d or are_of_two_rates):
         raise GavoError(
-            f"{color[a]}: colour images are {a} to {b}, depth images {c} to {d}: give those of one frame one "
-            "number, or leave those without a partner out"
+            f"{color[a]}: colour images are {a} to {b}, depth images {c} to {d}: give those of one frame the "
+            "same number, or remove those without a partner"
         )
 
 
@@ -153,7 +153,7 @@ def _fault(files: Sequence[Path]) -> str | None:
     first: dict[tuple[int, ...], Path] = {}
     for file in files:
         if (other := first.setdefault(tuple(_numbers(file)), file)) is not file:
-            return f"{file}: has the same number as {other.name}: leave one of them there"
+            return f"{file}: has the same number as {other.name}: keep only one of them"
     return None
 
 

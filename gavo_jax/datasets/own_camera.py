@@ -49,8 +49,8 @@ def own_camera_file(folder: Path) -> Path | None:
     other = file.with_name(re.sub("(_|^)color", r"\1depth", file.name))
     if other.is_file() and read_text(other).split() != read_text(file).split():
         raise GavoError(
-            f"{file}: {other.name} beside it is of another camera: say --camera with a file of both cameras "
-            "([depth], colour_T_depth), or of one if depth is registered to colour"
+            f"{file}: {other.name} beside it belongs to another camera: pass --camera with a file for both cameras "
+            "([depth], colour_T_depth), or for one if depth is registered to colour"
         )
     return file
 

@@ -23,7 +23,7 @@ def rectified(frame: Frame, camera: Camera) -> Frame:
         GavoError: `frame` is no Frame.
     """
     if not isinstance(frame, Frame):
-        raise GavoError(f"a Frame is needed, not {type(frame).__name__}: gavo.Frame(grey, depth, timestamp)")
+        raise GavoError(f"expected a Frame, got {type(frame).__name__}: use gavo.Frame(grey, depth, timestamp)")
     for name, image in (("grey", frame.grey), ("depth", frame.depth)):
         require_image(name, image, (camera.height, camera.width))
     grey, depth = camera.undistort(*without_bars(as_array(frame.grey), as_depth(frame.depth)))

@@ -111,7 +111,7 @@ CALLS = {"recognises": ("path",), "open": ("path", "reading")}
 def _require_dataset(dataset: Any) -> None:
     name = getattr(dataset, "__name__", type(dataset).__name__)
     if not (isinstance(kind := getattr(dataset, "kind", None), str) and kind):
-        raise GavoError(f"dataset {name}: kind: what it is called is needed, a text")
+        raise GavoError(f"dataset {name}: kind: expected its name as text")
     for method, arguments in CALLS.items():
         call, form = getattr(dataset, method, None), f"{method}({', '.join(arguments)})"
         if not callable(call):
@@ -119,8 +119,8 @@ def _require_dataset(dataset: Any) -> None:
         try:
             inspect.signature(call).bind(*arguments)
         except TypeError:
-            hint = ": a classmethod is needed, or an object of the class" if isinstance(dataset, type) else ""
-            raise GavoError(f"dataset {name}: {form} cannot be called so{hint}") from None
+            hint = ": make it a classmethod, or register an instance of the class" if isinstance(dataset, type) else ""
+            raise GavoError(f"dataset {name}: cannot be called as {form}{hint}") from None
         except ValueError:  # no signature available
             pass
 
@@ -156,16 +156,16 @@ def open_source(path: str | Path, reading: Reading | None = None) -> Sequence:
     """
     path, reading = as_path(path), Reading() if reading is None else reading
     if not isinstance(reading, Reading):
-        raise GavoError(f"a Reading is needed, not {type(reading).__name__}: gavo.Reading(camera=…)")
+        raise GavoError(f"expected a Reading, got {type(reading).__name__}: use gavo.Reading(camera=…)")
     try:
         exists = path.exists()
     except (OSError, ValueError) as error:
         raise GavoError(f"{str(path)!r}: unusable: {getattr(error, 'strerror', None) or error}") from None
     if not exists:
-        raise GavoError(f"{path}: no such folder or file: name one, or the word synthetic")
+        raise GavoError(f"{path}: no such folder or file: pass an existing one, or the word synthetic")
     dataset = recognise(path)
     if dataset in BUILT_IN and (useless := set(reading.given()) & USELESS.get(dataset, TOPICS)):
-        raise GavoError(f"{path}: {min(useless)} says nothing of a {dataset.kind}")
+        raise GavoError(f"{path}: {min(useless)} does not apply to this kind of source ({dataset.kind})")
     return dataset.open(path, reading) if dataset in BUILT_IN else _open_others(dataset, path, reading)
 
 
@@ -175,7 +175,9 @@ def _open_others(dataset: Dataset, path: Path, reading: Reading) -> Sequence:
     with blamed(whose):
         sequence = dataset.open(path, reading)
         if lacking := [name for name in RUN if not hasattr(sequence, name)]:
-            raise GavoError(f"{whose}: open gives {type(sequence).__name__}, no Sequence: no {', '.join(lacking)}")
+            raise GavoError(
+                f"{whose}: open returns {type(sequence).__name__}, not a Sequence: it has no {', '.join(lacking)}"
+            )
     return sequence
 
 

@@ -44,7 +44,7 @@ def open_part(
     """
     reading = reading or Reading()
     if source == SYNTHETIC and (given := reading.given()):
-        raise GavoError(f"{given[0]}: is not of the {SYNTHETIC} room")
+        raise GavoError(f"{given[0]}: does not apply to the {SYNTHETIC} room")
     stop = None if frames is None else start + (frames - 1) * stride + 1
     reading = replace(reading, camera=camera)
     whole = _synthetic(camera, stop, moving, reading.color) if source == SYNTHETIC else open_source(source, reading)
@@ -52,12 +52,12 @@ def open_part(
     if len(chosen) < 2:
         left_out = "".join(f"; {line}" for line in getattr(whole, "left_out", ()))
         raise GavoError(
-            f"{source}: {len(chosen)} of its {len(whole)} frames chosen by start, frames and stride: "
+            f"{source}: start, frames and stride select {len(chosen)} of its {len(whole)} frames: "
             f"at least 2 are needed{left_out}"
         )
     chosen.check()
     if source != SYNTHETIC and not force and (fault := lack_of_depth(chosen) or fault_of_depth(chosen)):
-        raise GavoError(f"{source}: {fault}, or go on with --force")
+        raise GavoError(f"{source}: {fault}, or continue with --force")
     return chosen
 
 

@@ -28,7 +28,7 @@ OTHER_NAMES = re.compile(
 OTHER_FOLDERS = re.compile(r"(.*[-_])?(poses?|traj|trajectory|extrinsics?)", re.IGNORECASE)
 """Folders that look as if they held a trajectory."""
 
-NO_TRUTH = "an estimate of the program that wrote the images, and no truth: gavo evaluate compares a run with it"
+NO_TRUTH = "an estimate by the program that wrote the images, not the truth; gavo evaluate can compare a run with it"
 
 LOG = "trajectory.log"
 """Name of a trajectory in Redwood's format, which Open3D also writes."""
@@ -78,7 +78,7 @@ def truth_in(
         try:
             truth = Trajectory.read_tum(folder / TRUTH)
         except GavoError as error:
-            raise GavoError(f"{error}; by another name it is not read") from None
+            raise GavoError(f"{error}; rename it to have it ignored") from None
         return _timed(truth, folder / TRUTH, list(frames), seconds)
     if (file := icl_truth(folder)) is not None:
         return _read_icl(file, seconds)
@@ -119,7 +119,7 @@ def _behind(numbers: np.ndarray, place: Path, frames: list[float], seconds: Seco
         return a - c
     if {a, c} == {0, 1} and b != d and min(len(images), len(numbers)) >= FEWEST:
         raise GavoError(
-            f"{place}: counts {c} to {d}, the images {a} to {b}: give the poses the numbers of their images"
+            f"{place}: poses are numbered {c} to {d}, images {a} to {b}: give the poses the numbers of their images"
         )
     return 0
 
@@ -174,7 +174,7 @@ def _how_to_name(folder: Path, names: list[str]) -> str:
         rows = []
     if path.is_dir() or (rows and len(rows[0][1]) != 8):
         return f"{path.name}: if it is the true trajectory, {into}"
-    return f"{path.name}: if it is the true trajectory (timestamp tx ty tz qx qy qz qw), name it {TRUTH}"
+    return f"{path.name}: if it is the true trajectory (timestamp tx ty tz qx qy qz qw), rename it to {TRUTH}"
 
 
 def counted_in(trajectory: Trajectory) -> float:
@@ -191,7 +191,7 @@ def icl_truth(folder: Path) -> Path | None:
     """
     files = sorted(file for file in folder.glob(ICL) if not file.name.startswith("."))
     if len(files) > 1:
-        raise GavoError(f"{folder}: {files[0].name} and {files[1].name}: leave one of them there")
+        raise GavoError(f"{folder}: contains both {files[0].name} and {files[1].name}: keep only one of them")
     return files[0] if files else None
 
 
@@ -199,11 +199,12 @@ def _read_icl(path: Path, seconds: Seconds | None) -> Trajectory:
     truth = Trajectory.read_tum(path)
     if not _are_whole(truth):
         raise GavoError(
-            f"{path}: expected the numbers of frames in its first column: name it {TRUTH} if they are stamps"
+            f"{path}: expected frame numbers in the first column: rename it to {TRUTH} if they are timestamps"
         )
     if seconds is None:
         raise GavoError(
-            f"{path}: counts frames, and the images have stamps: give the poses theirs, in a file named {TRUTH}"
+            f"{path}: its poses have frame numbers, but the images have timestamps: give the poses timestamps, in a "
+            f"file named {TRUTH}"
         )
     return replace(truth, timestamps=seconds(truth.timestamps), world_T_camera=MIRROR @ truth.world_T_camera @ MIRROR)
 
@@ -238,7 +239,7 @@ def read_log(path: Path, times: Mapping[int, float]) -> Trajectory | None:
     named = {n + ahead: times[n] for n in numbers}
     if not blocks.keys() & named.keys():
         if len(blocks) != len(numbers):
-            raise GavoError(f"{path}: none of its frames ({min(blocks)} to {max(blocks)}) is there")
+            raise GavoError(f"{path}: none of its frames ({min(blocks)} to {max(blocks)}) has an image")
         named = {ours: times[n] for ours, n in zip(sorted(blocks), numbers, strict=True)}
     known = [frame for frame in sorted(poses) if frame in named]
     if not known:
@@ -252,7 +253,7 @@ def _blocks(path: Path) -> dict[int, tuple[str, list[str]]]:
     """The sixteen matrix fields and the location (file:line) of each block, by its third number."""
     rows, blocks = data_rows(path), {}
     if not rows:
-        raise GavoError(f"{path}: holds no trajectory (no rows)")
+        raise GavoError(f"{path}: contains no trajectory (no rows)")
     for (place, head), *matrix in (rows[at : at + 5] for at in range(0, len(rows), 5)):
         if len(head) != 3 or not all(re.fullmatch(r"-?\d{1,18}", field) for field in head):
             raise GavoError(f"{place}: expected three whole numbers before each matrix, found {' '.join(head)[:60]!r}")
@@ -260,7 +261,7 @@ def _blocks(path: Path) -> dict[int, tuple[str, list[str]]]:
             raise GavoError(f"{place}: expected four rows of four numbers after it")
         frame = int(head[2])
         if frame in blocks:
-            raise GavoError(f"{place}: frame {frame} is there twice")
+            raise GavoError(f"{place}: frame {frame} appears twice")
         blocks[frame] = place, [field for _, fields in matrix for field in fields]
     return blocks
 
@@ -299,7 +300,7 @@ def pose_of(place: str, fields: Sequence[str]) -> Float[np.ndarray, "4 4"] | Non
     turns = np.abs(pose - matrix).max() <= SKEWED and np.linalg.det(pose[:3, :3]) > 0
     if turns and np.abs(pose[:3, 3]).max() < MAX_MAGNITUDE:
         return pose
-    raise GavoError(f"{place}: the pose is no rotation and shift (last row 0 0 0 1)")
+    raise GavoError(f"{place}: the pose is not a rotation and translation (last row 0 0 0 1)")
 
 
 def by_stamp(poses: Mapping[float, Float[np.ndarray, "4 4"]]) -> Trajectory:
@@ -323,7 +324,7 @@ def numbers_in(place: str, fields: Sequence[str], count: int) -> list[float] | N
     if not np.isfinite(values).all():
         return None
     if np.abs(values).max() > LARGEST:
-        raise GavoError(f"{place}: holds an absurdly large value")
+        raise GavoError(f"{place}: contains an absurdly large value")
     return values
 
 
@@ -347,7 +348,7 @@ def in_order(path: Path, images: Iterable[int]) -> Iterable[tuple[int, str, list
     """
     rows, numbers = data_rows(path), sorted(images)
     if not rows:
-        raise GavoError(f"{path}: holds no trajectory (no rows)")
+        raise GavoError(f"{path}: contains no trajectory (no rows)")
     if len(rows[0][1]) == 4 and len(rows) >= 4:
         blocks = (rows[at : at + 4] for at in range(0, len(rows), 4))
         rows = [(block[0][0], [field for _, fields in block for field in fields]) for block in blocks]

@@ -36,30 +36,30 @@ PACKED = {
 """Suffixes of archives, and the command that unpacks each."""
 
 RECORDINGS = {
-    ".sens": "a scan as ScanNet packs it: export it with ScanNet's SensReader, and name the folder",
-    ".mkv": "a film, or a recording of Azure Kinect: write its images with Open3D's azure_kinect_mkv_reader.py",
-    ".svo": "a recording of a ZED: write its images and depth with the ZED SDK's export samples",
-    ".svo2": "a recording of a ZED: write its images and depth with the ZED SDK's export samples",
-    ".oni": "a recording of OpenNI: write its images and depth with OpenNI's tools",
+    ".sens": "a packed ScanNet scan: export it with ScanNet's SensReader, and pass the folder",
+    ".mkv": "a film or an Azure Kinect recording: extract its images with Open3D's azure_kinect_mkv_reader.py",
+    ".svo": "a ZED recording: extract its images and depth with the ZED SDK's export samples",
+    ".svo2": "a ZED recording: extract its images and depth with the ZED SDK's export samples",
+    ".oni": "an OpenNI recording: extract its images and depth with OpenNI's tools",
     ".r3d": RECORD_3D,
-    ".klg": "a log of ElasticFusion's logger: write its images and depth first",
+    ".klg": "a log of ElasticFusion's logger: extract its images and depth first",
 }
 """Suffixes of proprietary recordings, and how to convert each."""
 
 PACKED_ARRAYS = {
     **dict.fromkeys((".hdf5", ".h5"), f"arrays in HDF5: {ARRAYS} (h5py)"),
-    ".mat": f"arrays of MATLAB: {ARRAYS} (scipy.io.loadmat, or h5py from version 7.3 on)",
-    **dict.fromkeys((".npz", ".npy", ".pkl"), f"arrays of Python: {ARRAYS}"),
+    ".mat": f"MATLAB arrays: {ARRAYS} (scipy.io.loadmat, or h5py from version 7.3 on)",
+    **dict.fromkeys((".npz", ".npy", ".pkl"), f"Python arrays: {ARRAYS}"),
     **dict.fromkeys((".parquet", ".arrow", ".tfrecord"), f"a table: {ARRAYS}"),
-    ".raw": f"images without a head: {ARRAYS}; of rs-convert name the .bag that it has read",
-    ".rrd": f"a recording of Rerun: {ARRAYS}",
+    ".raw": f"images without a header: {ARRAYS}; after rs-convert, pass the .bag that it has read",
+    ".rrd": f"a Rerun recording: {ARRAYS}",
 }
 """What holds images in a form that is no image's and no recording's."""
 
 MODELS = (".ply", ".pcd", ".obj", ".glb", ".usdz", ".e57", ".las")
 """Endings of files of points or surfaces."""
 
-MODEL = "a model or a cloud of points, without the images that it was made of"
+MODEL = "a model or a point cloud, without the images that it was made from"
 
 DEPTH_IN_NAME = re.compile(r"(?<![a-z])depth", re.IGNORECASE)
 
@@ -93,10 +93,10 @@ def describe(path: Path, kinds: Sequence[str], is_source: Callable[[Path], bool]
         kinds: The known kinds of sources.
         is_source: Tells whether another path holds one of them.
     """
-    known = f"{', '.join(WHAT_OF.sub('', kind) for kind in kinds)} (SUN3D's, too)"
+    known = f"{', '.join(WHAT_OF.sub('', kind) for kind in kinds)} (including SUN3D's)"
     if not path.is_dir():
         if path.is_file() and (source := source_around(path, is_source)):
-            return f"a file of a source: name its folder, {source}"
+            return f"a file inside a source: pass its folder, {source}"
         return _in_file(path) or f"a file of {path.stat().st_size} bytes, not one of: {known}"
     place = Place(path, sorted(path.iterdir()), known, is_source)
     return next(words for guess in GUESSES if (words := guess(place)) is not None)
@@ -124,8 +124,8 @@ def _frames_apart(place: Place) -> str | None:
     if len(folders) < 2 or any(tuple(map(len, plain_files(folder))) != (1, 1) for folder in folders):
         return None
     return (
-        f"{len(folders)} folders of one frame each, as {folders[0].name[:60]}: if they are of one recording, link "
-        "their images into rgb/ and depth/, by the numbers of the folders"
+        f"{len(folders)} folders of one frame each, such as {folders[0].name[:60]}: if they belong to one recording, "
+        "link their images into rgb/ and depth/, named by the numbers of the folders"
     )
 
 
@@ -133,8 +133,8 @@ def _sources(place: Place) -> str | None:
     names = [child.name for child in place.inside if not child.name.startswith(".") and place.is_source(child)]
     if not names:
         return None
-    there = f"{len(names)}: name one of {_listed(names)}" if len(names) > 1 else f"one: name {names[0][:60]}"
-    return f"no source itself, but a folder of {there}"
+    there = f"{len(names)}: pass one of {_listed(names)}" if len(names) > 1 else f"one: pass {names[0][:60]}"
+    return f"not a source itself, but a folder of {there}"
 
 
 def _images_missing(place: Place) -> str | None:
@@ -148,10 +148,10 @@ def _stereo(place: Place) -> str | None:
         return None
     if (stereo / "depth0" / "data").is_dir():
         return (
-            f"{stereo / 'depth0'}: link its images as depth/, beside rgb/; InteriorNet's, which are lengths of rays, "
+            f"{stereo / 'depth0'}: link its images as depth/, beside rgb/; InteriorNet's are ray lengths, and "
             f"have to be written there {AS_DEPTH}"
         )
-    return f"{stereo / 'cam0'}: a recording as EuRoC has it, of stereo images without depth, which this needs"
+    return f"{stereo / 'cam0'}: a recording in the layout of EuRoC: stereo images without depth, which is required"
 
 
 def _known(place: Place) -> str | None:
@@ -162,10 +162,10 @@ def _rays(place: Place) -> str | None:
     rays = f"have to be written into depth/, beside rgb/, {AS_DEPTH}"
     names = {child.name for child in place.inside}
     if {"photo", "depth", "instance"} <= names:
-        return f"depth/: SceneNet RGB-D's are lengths of rays, which {rays}; link photo/ as rgb/"
+        return f"depth/: SceneNet RGB-D stores ray lengths, which {rays}; link photo/ as rgb/"
     if (found := next((name for name in sorted(names) if name.startswith("distance_to_camera")), None)) is None:
         return None
-    return f"{found[:60]}: Replicator's lengths of rays: write distance_to_image_plane there, or they {rays}"
+    return f"{found[:60]}: ray lengths from Replicator: have it write distance_to_image_plane, or they {rays}"
 
 
 def _recording(place: Place) -> str | None:
@@ -176,12 +176,12 @@ def _recording(place: Place) -> str | None:
 
 def _part_of_source(place: Place) -> str | None:
     source = source_around(place.path, place.is_source)
-    return source and f"a folder inside a source: name the source, {source}"
+    return source and f"a folder inside a source: pass the source, {source}"
 
 
 def _further_down(place: Place) -> str | None:
     found = next((inner for inner in islice(_further(place), LOOKED_INTO) if place.is_source(inner)), None)
-    return found and f"no source itself, but one lies further down: name {found.relative_to(place.path)}"
+    return found and f"not a source itself, but contains one: pass {found.relative_to(place.path)}"
 
 
 def _further(place: Place) -> Iterator[Path]:
@@ -207,7 +207,7 @@ def _twins(place: Place) -> str | None:
     twins = next(((by_stem[image.stem], image) for image in images if by_stem[image.stem] != image), None)
     if twins is None:
         return None
-    return f"{twins[0].name[:60]} beside {twins[1].name[:60]}: put what is depth into depth/, and colour into rgb/"
+    return f"{twins[0].name[:60]} beside {twins[1].name[:60]}: put depth into depth/, and colour into rgb/"
 
 
 def _folder(place: Place) -> str:
@@ -245,11 +245,11 @@ def _in_file(file: Path) -> str | None:
     """Describe how to turn a file into a source, judged by its name; None where the name tells nothing."""
     before, last = ["", "", *(suffix.lower() for suffix in file.suffixes)][-2:]
     if (before, last) == (".bag", ".active"):
-        return "a recording that was never closed: mend it with rosbag reindex, and name it .bag"
+        return "a recording that was never closed: repair it with rosbag reindex, and rename it to .bag"
     if last in FILMS and DEPTH_IN_NAME.search(file.name):
         return (
-            "a film of depth: where it has 16 bits, write its frames as images into depth/, beside rgb.mp4 or rgb/ "
-            "(ffmpeg -i FILM -start_number 0 depth/%06d.png); one of 8 bits is a picture of depth, and of no use"
+            "a film of depth: if it has 16 bits, write its frames as images into depth/, beside rgb.mp4 or rgb/ "
+            "(ffmpeg -i FILM -start_number 0 depth/%06d.png); one of 8 bits is only a picture of depth, and useless"
         )
     if last in RECORDINGS:
         return RECORDINGS[last]

@@ -475,7 +475,7 @@ def test_align_does_not_mix_floats_and_whole_numbers(gavo, clip):
     np.save(clip / "depth.npy", raw / np.float32(CAMERA.depth_scale))
     for pair in ((depth[0], clip / "depth.npy"), (clip / "depth.npy", depth[0])):
         done = gavo("align", rgb[0], pair[0], rgb[1], pair[1])
-        assert is_refused(done, f"{depth[0]}: depth in whole numbers, and in floats in {clip / 'depth.npy'}")
+        assert is_refused(done, f"{depth[0]}: depth in whole numbers, but floats in {clip / 'depth.npy'}")
 
 
 def test_align_says_which_images_unit_is_doubted(gavo, clip):

@@ -54,10 +54,10 @@ def _method():
 @pytest.mark.parametrize(
     ("name", "opened", "words"),
     [
-        ("", Player, "name: a word is needed, not ''"),
-        (None, Player, "name: a word is needed, not None"),
-        ([], Player, "name: a word is needed"),
-        ("player", None, "'player': what opens it is needed, a function, not None"),
+        ("", Player, "name: expected a word, got ''"),
+        (None, Player, "name: expected a word, got None"),
+        ([], Player, "name: expected a word"),
+        ("player", None, "'player': expected a function that opens it, got None"),
     ],
 )
 def test_what_is_no_device_is_refused_at_once(name, opened, words):

@@ -108,10 +108,10 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         ["associations.txt:1", "expected"],
     ),
     "image: empty": ("tum", write(f"rgb/{FIRST}", b""), [FIRST, "empty file"]),
-    "image: torn PNG": ("tum", cut(f"rgb/{FIRST}", 0.5), [FIRST, "torn PNG", "anew"]),
-    "image: text": ("tum", write(f"rgb/{FIRST}", "hello"), [FIRST, "no image", "hello"]),
-    "image: torn JPEG": ("scannet", cut("color/0.jpg", 0.5), ["color/0.jpg", "torn or damaged", "anew"]),
-    "image: torn JPEG, deep": ("replica", cut("results/frame000000.jpg", 0.9), ["frame000000.jpg", "torn or damaged"]),
+    "image: torn PNG": ("tum", cut(f"rgb/{FIRST}", 0.5), [FIRST, "truncated PNG", "again"]),
+    "image: text": ("tum", write(f"rgb/{FIRST}", "hello"), [FIRST, "not an image", "hello"]),
+    "image: torn JPEG": ("scannet", cut("color/0.jpg", 0.5), ["color/0.jpg", "truncated or damaged", "again"]),
+    "image: torn JPEG, deep": ("replica", cut("results/frame000000.jpg", 0.9), ["frame000000.jpg", "or damaged"]),
     "image: another size": ("plain", pixels("rgb/0.png", SMALL), ["rgb/0.png", "80x60", "160x120", "--camera"]),
     "image: of floats": (
         "tum",
@@ -125,7 +125,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         [FIRST, "not a depth image", "3 channels"],
     ),
     "depth: a JPEG": ("tum", write(f"depth/{FIRST}", encoded(".jpg", GREYS[0])), [FIRST, "not a depth image"]),
-    "depth: torn TIFF": ("plain", cut("depth/0.tiff", 0.5), ["depth/0.tiff", "torn or damaged"]),
+    "depth: torn TIFF": ("plain", cut("depth/0.tiff", 0.5), ["depth/0.tiff", "truncated or damaged"]),
     "depth: torn array": ("one_folder", cut("depth_000.npy", 0.5), ["depth_000.npy", "not a NumPy array"]),
     "depth: array of text": (
         "one_folder",
@@ -160,7 +160,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     "7-scenes: a skewed pose": (
         "seven_scenes",
         lambda clip: np.savetxt(clip / "frame-000002.pose.txt", 3 * np.eye(4)),
-        ["000002.pose.txt", "no rotation"],
+        ["000002.pose.txt", "not a rotation"],
     ),
     "7-scenes: intrinsics of prose": (
         "seven_scenes",
@@ -180,12 +180,12 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     "stray: frames of another size": (
         "stray",
         lambda clip: [image(clip / f"rgb/{i:06}.png", cv2.resize(GREYS[i], (320, 180))) for i in range(4)],
-        ["clip: images of 320x180", "of a film of 1920x1440", "do not crop them"],
+        ["clip: images of 320x180", "from a film of 1920x1440", "do not crop them"],
     ),
     "stray: poses of other frames": (
         "stray",
         edit("odometry.csv", ", 0000", ", 0050"),
-        ["odometry.csv: has no row of any frame"],
+        ["odometry.csv: contains no row for any"],
     ),
     "stray: poses of prose": ("stray", write("odometry.csv", "up\n"), ["odometry.csv:1: expected 9 numbers"]),
     "stray: depth of another shape": (
@@ -206,7 +206,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     "scannet++: no camera": (
         "scannet_plus_plus",
         edit("pose_intrinsic_imu.json", '"intrinsic"', '"lens"'),
-        ["pose_intrinsic_imu.json: has no camera", "--camera"],
+        ["pose_intrinsic_imu.json: contains no camera", "--camera"],
     ),
     "scannet++: a camera of four numbers": (
         "scannet_plus_plus",
@@ -230,7 +230,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         write("scene_camera.json", '{"1": {"cam_K": [1, 0, 0, 0, 1, 0, 0, 0]}}'),
         ["scene_camera.json: expected a camera matrix of nine numbers"],
     ),
-    "bop: no matrix": ("bop", write("scene_camera.json", '{"1": {}}'), ["has no camera of any frame: say --camera"]),
+    "bop: no matrix": ("bop", write("scene_camera.json", '{"1": {}}'), ["contains no camera for any frame: pass"]),
     "bop: units that differ": (
         "bop",
         write("scene_camera.json", '{"1": {"depth_scale": 0.1}, "2": {"depth_scale": 1.0}}'),
@@ -262,7 +262,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         write("poses.txt", "1 2 3"),
         ["poses.txt:1: expected a pose"],
     ),
-    "semantic nerf: no poses": ("semantic_replica", write("traj_w_c.txt", ""), ["traj_w_c.txt: holds no trajectory"]),
+    "semantic nerf: no poses": ("semantic_replica", write("traj_w_c.txt", ""), ["traj_w_c.txt: contains no traj"]),
     "polycam: a camera without numbers": (
         "polycam",
         lambda clip: [write(f"cameras/{file.name}", "{}")(clip) for file in list((clip / "cameras").iterdir())],
@@ -283,7 +283,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         lambda clip: write(f"lowres_wide_intrinsics/41069021_{ARKIT_STAMPS[1]}.pincam", "160 120 140 131 79.5 59.5")(
             clip
         ),
-        ["lowres_wide_intrinsics: each frame has a camera of its own", "fx differs by 9"],
+        ["lowres_wide_intrinsics: the frames have different cameras", "fx differs by 9"],
     ),
     "arkitscenes: poses of prose": (
         "arkit_scenes",
@@ -330,11 +330,15 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         write("extrinsic.txt", "up\n"),
         ["extrinsic.txt:1: expected the"],
     ),
-    "airsim: a torn row": ("airsim", cut("airsim_rec.txt", 0.81), ["airsim_rec.txt:5: expected 10 values"]),
+    "airsim: a torn row": (
+        "airsim",
+        cut("airsim_rec.txt", 0.81),
+        ["airsim_rec.txt:5: expected 10 tab-separated values"],
+    ),
     "airsim: a file of prose": (
         "airsim",
         write("airsim_rec.txt", "up\n"),
-        ["airsim_rec.txt: expected names of columns"],
+        ["airsim_rec.txt: expected tab-separated column names"],
     ),
     "airsim: no camera": ("airsim", remove("camera.toml"), ["clip: no camera file in it", "--camera"]),
     "rtabmap: a camera of prose": (
@@ -368,7 +372,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     "tum: icl's truth, twice": (
         "associations",
         lambda clip: [write(f"{i}.gt.freiburg", "1 0 0 0 0 0 0 1\n")(clip) for i in "ab"],
-        ["clip: a.gt.freiburg and b.gt.freiburg", "leave one"],
+        ["clip: contains both a.gt.freiburg and b.gt.freiburg", "keep only one"],
     ),
     "plain: no camera": ("plain", remove("camera.yaml"), ["clip", "no camera file", "no camera known", "--camera"]),
     "plain: YAML that is none": ("plain", write("camera.yaml", "fx: [1, 2"), ["camera.yaml", "not YAML"]),
@@ -384,7 +388,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     "plain: colour of another ending": (
         "plain",
         lambda clip: [file.rename(file.with_suffix(".raw")) for file in list((clip / "rgb").iterdir())],
-        ["clip: no colour images in rgb (0.raw, 1.raw)", "end in .png"],
+        ["clip: no colour images in rgb (0.raw, 1.raw)", "ending in .png"],
     ),
     "plain: folders of other names": (
         "plain",
@@ -400,16 +404,16 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
         ],
         ["clip: no frame", "same number"],
     ),
-    "replica: no pose": ("replica", write("traj.txt", ""), ["traj.txt", "holds no trajectory"]),
+    "replica: no pose": ("replica", write("traj.txt", ""), ["traj.txt", "contains no trajectory"]),
     "scannet: a pose on its side": (
         "scannet",
         lambda clip: np.savetxt(clip / "pose/1.txt", np.eye(4) + np.eye(4, k=-3)),
-        ["pose/1.txt", "no rotation and shift"],
+        ["pose/1.txt", "not a rotation and translation"],
     ),
     "tum: names with blanks": (
         "tum",
         edit("rgb.txt", "rgb/", "my rgb/"),
-        ["rgb.txt:2", "expected `timestamp path`, of no blanks", "3 fields"],
+        ["rgb.txt:2", "expected `timestamp path`, with no blanks", "3 fields"],
     ),
     "tum: a folder for an image": (
         "tum",
@@ -419,7 +423,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     "kalibr: another kind of camera": (
         "plain",
         write("camera.yaml", "cam0:\n  camera_model: omni\n"),
-        ["camera.yaml: camera_model 'omni': pinhole"],
+        ["camera.yaml: camera_model 'omni': only pinhole"],
     ),
     "plain: only colour": ("plain", remove("depth"), ["clip: a folder of", "no folder of depth beside rgb/"]),
     "nothing at all": (
@@ -495,20 +499,20 @@ OTHERS: dict[str, tuple[Callable[[Path], Path], list[str]]] = {
     "a path that cannot be": (lambda path: path / ("x" * 300), ["unusable"]),
     "a film": (file_of("walk.mp4", bytes(100)), ["walk.mp4", "a film", "frames as images"]),
     "record3d": (file_of("walk.r3d", b"PK"), ["walk.r3d", "Record3D", "EXR + RGB"]),
-    "nyu": (nyu, ["room: the raw recording of NYU Depth", "toolbox", "rgb/ and depth/"]),
-    "euroc": (euroc, ["mav0/cam0: a recording as EuRoC has it", "without depth"]),
-    "bag: empty": (file_of("x.bag", b""), ["x.bag", "not a bag"]),
-    "bag: text": (file_of("x.bag", b"hello"), ["x.bag", "not a bag"]),
+    "nyu": (nyu, ["room: a raw recording of NYU Depth", "toolbox", "rgb/ and depth/"]),
+    "euroc": (euroc, ["mav0/cam0: a recording in the layout of EuRoC", "without depth"]),
+    "bag: empty": (file_of("x.bag", b""), ["x.bag", "cannot be read as a bag"]),
+    "bag: text": (file_of("x.bag", b"hello"), ["x.bag", "cannot be read as a bag"]),
     "bag: torn": (torn_bag, ["x.bag"]),
-    "bag: no images": (no_images, ["x.bag", "holds no images", "sensor_msgs"]),
+    "bag: no images": (no_images, ["x.bag", "contains no images", "sensor_msgs"]),
     "bag: never closed": (file_of("x.bag.active", b"#ROSBAG V2.0\n"), ["x.bag.active", "never closed", "reindex"]),
     "an archive": (file_of("clip.tgz", b"\x1f\x8b"), ["clip.tgz", "packed", "tar -xf"]),
-    "mcap: text": (file_of("x.mcap", b"hello"), ["x.mcap", "not a bag"]),
-    "db3: text": (file_of("x.db3", b"hello" * 300), ["x.db3", "not a bag"]),
+    "mcap: text": (file_of("x.mcap", b"hello"), ["x.mcap", "cannot be read as a bag"]),
+    "db3: text": (file_of("x.db3", b"hello" * 300), ["x.db3", "cannot be read as a bag"]),
     "mcap: several colours": (two_colours, ["/left, /right", "--colour-topic"]),
     "mcap: no camera": (lambda path: record(path / "x", "mcap", "raw", SHOTS, None), ["no camera_info", "--camera"]),
     "sqlite: odd encoding": (odd_encoding, [COLOR, "nv24"]),
-    "ros 2: metadata of something else": (no_metadata, ["x", "not a bag"]),
+    "ros 2: metadata of something else": (no_metadata, ["x", "cannot be read as a bag"]),
 }
 
 

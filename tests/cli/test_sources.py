@@ -143,7 +143,7 @@ def test_inspect_says_what_a_source_is(gavo, clip):
     assert lines["source"] == "clip, TUM RGB-D folder" and lines["frames used"] == "8 of 8"
     assert "30.0 frames/s, no gap" in lines["time"]
     assert lines["camera"].startswith("160x120, fx 131 fy 131 cx 79.5 cy 59.5, from")
-    assert "5000 to a metre" in lines["depth"] and "8 of 8 frames covered" in lines["ground truth"]
+    assert "5000 per metre" in lines["depth"] and "8 of 8 frames covered" in lines["ground truth"]
 
 
 def test_inspect_tells_of_depth_that_stands_still(gavo, clip):
@@ -204,7 +204,7 @@ def test_inspect_as_json_counts_what_cannot_be_used(gavo, clip):
     facts = json.loads(done.out)
     assert [facts[key] for key in ("kind", "frames", "frames_used")] == ["TUM RGB-D folder", 7, 5]
     assert facts["frames_not_used"] == {"unreadable": 1, "frozen": 1} and torn.name in facts["why_not"][0]
-    assert facts["left_out"] == ["1 colour images: no depth image within 0.02 s that is not another's"]
+    assert facts["left_out"] == ["1 colour images: no depth image within 0.02 s that is not paired with another"]
     assert facts["rate_hz"] == pytest.approx(30, rel=1e-3) and facts["gaps"] == 0
     assert facts["delay_of_depth_ms"] == {"median": 0, "least": 0, "most": 0}
     assert facts["camera"]["fx"] == 131 and facts["camera_from"].endswith("camera.toml")
@@ -226,7 +226,7 @@ def test_run_says_what_makes_no_frame(gavo, clip, tmp_path):
     rows = (clip / "depth.txt").read_text().splitlines(True)
     (clip / "depth.txt").write_text("".join(rows[:4] + rows[6:]))
     done = gavo("run", clip, *FAST, "--output", "out")
-    line = "2 colour images: no depth image within 0.02 s that is not another's"
+    line = "2 colour images: no depth image within 0.02 s that is not paired with another"
     assert (
         done.status == 0 and done.out.splitlines()[1] == "left out: 2 colour images; metrics.json says why (left_out)"
     )

@@ -43,7 +43,7 @@ FAULTS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
 def test_numbers_that_are_no_depth_are_refused_in_one_line_unless_forced(tmp_path: Path, name: str) -> None:
     as_stored, words = FAULTS[name]
     folder = source(tmp_path, [as_stored(depth) for depth in KINECTS_DEPTH])
-    with pytest.raises(GavoError, match=f"{folder}: .*{words}.*, or go on with --force$") as caught:
+    with pytest.raises(GavoError, match=f"{folder}: .*{words}.*, or continue with --force$") as caught:
         open_part(str(folder))
     assert len(str(caught.value).splitlines()) == 1
     assert len(open_part(str(folder), force=True)) == len(METRES)

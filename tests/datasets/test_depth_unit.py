@@ -123,7 +123,7 @@ def test_floats_that_may_be_shares_of_a_greatest_distance_are_told(tmp_path, rea
         image(tmp_path / f"rgb/{i}.png", np.full((120, 160), 99, np.uint8))
         image(tmp_path / f"depth/{i}.npy", (metres / reach).astype(np.float32))
     doubt = doubt_of_scale(open_source(tmp_path, Reading(CAMERA)))
-    assert (doubt is not None and "shares of a greatest distance: say --depth-scale 0.1 where" in doubt) == is_told
+    assert (doubt is not None and "fractions of a largest distance: pass --depth-scale 0.1 if" in doubt) == is_told
 
 
 @pytest.mark.parametrize("is_packed", [True, False])
@@ -135,7 +135,7 @@ def test_floats_of_16_bits_in_png_are_told(tmp_path, is_packed):
         image(tmp_path / f"depth/{i}.png", depth.astype(np.float16).view(np.uint16) if is_packed else raw(depth, 7000))
     doubt = doubt_of_scale(open_source(tmp_path, Reading(CAMERA, depth_scale=1000.0)))
     middle = f"{np.median(np.concatenate(METRES[:3])) + 3:.1f}"
-    assert doubt and ("as bits of floats, which Mid-Air keeps in PNG" in doubt) == is_packed
+    assert doubt and ("as bits of floats, as in PNG of Mid-Air" in doubt) == is_packed
     assert not is_packed or f"it is {middle}" in doubt
 
 
@@ -149,7 +149,7 @@ def test_a_wrong_scale_is_refused_in_one_line_unless_forced(tmp_path):
     wrong = tmp_path / "wrong.toml"
     wrong.write_text("fx=131\nfy=131\ncx=79.5\ncy=59.5\nwidth=160\nheight=120\ndepth_scale=5000\n")
     with pytest.raises(
-        GavoError, match=r"clip: .*millimetres: set --depth-scale 1000, or go on with --force"
+        GavoError, match=r"clip: .*millimetres; set --depth-scale 1000, or continue with --force"
     ) as caught:
         open_part(str(tmp_path / "clip"), str(wrong))
     assert len(str(caught.value).splitlines()) == 1

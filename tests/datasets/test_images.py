@@ -132,7 +132,7 @@ def test_images_beyond_the_scale_of_those_that_were_looked_at_first_are_told_onc
         frame = sequence[1]
     words = [str(warning.message) for warning in told]
     assert len(words) == 2 and all("1." in line for line in words)
-    assert "what exceeds 255 is white" in words[0] and "depth beyond 13.1 m is left out" in words[1]
+    assert "values above 255 become white" in words[0] and "depth beyond 13.1 m is left out" in words[1]
     assert not frame.depth[METRES * 4 > 13.2].any()
     _ = sequence[1], sequence[2]
 
@@ -191,7 +191,7 @@ def test_a_tiff_of_floats_of_16_bits_is_refused_for_what_it_is(tmp_path):
     table = struct.pack("<H", len(tags)) + b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
     head = b"II*\0" + struct.pack("<I", 8 + 6144)
     (tmp_path / "depth.tif").write_bytes(head + METRES.astype("<f2").tobytes() + table + bytes(4))
-    with pytest.raises(FrameError, match=r"depth\.tif: a TIFF of floats of 16 bits, .*: write 32 bits, or \.npy"):
+    with pytest.raises(FrameError, match=r"depth\.tif: a TIFF of 16-bit floats, .*: write 32 bits, or \.npy"):
         read_depth(tmp_path / "depth.tif")
 
 
@@ -212,8 +212,8 @@ EXR = {
     "beside colour": ({"RGBA": np.dstack([METRES * 0] * 4), "Z": METRES}, None),
     "of a layer": ({**{f"View.Combined.{c}": METRES * 0 for c in "RGB"}, "View.Depth.Z": METRES}, None),
     "of a word": ({"RGB": np.dstack([METRES * 0] * 3), "Depth.V": METRES}, None),
-    "colour": ({"RGB": np.dstack([METRES, METRES * 0, METRES])}, "an OpenEXR image of colour"),
-    "several": ({"U": METRES, "V": METRES}, "one has to be depth, named Z: found U, V"),
+    "colour": ({"RGB": np.dstack([METRES, METRES * 0, METRES])}, "a colour OpenEXR image"),
+    "several": ({"U": METRES, "V": METRES}, "has to be depth, named Z: found U, V"),
 }
 
 
@@ -240,7 +240,7 @@ def test_the_unit_of_floats_can_be_said(tmp_path, color_file):
 
 def test_floats_beside_whole_numbers_are_in_no_common_unit(tmp_path, color_file):
     pair = [(color_file, write(tmp_path / name, raw)) for name, raw in (("a.npy", METRES), ("b.png", RAW))]
-    with pytest.raises(GavoError, match=r"b\.png: depth in whole numbers, and in floats in .*a\.npy.*--depth-scale"):
+    with pytest.raises(GavoError, match=r"b\.png: depth in whole numbers, but floats in .*a\.npy.*--depth-scale"):
         open_pair(pair, Calibration(CAMERA))[0]
     pair[1] = color_file, write(tmp_path / "none.png", np.zeros_like(RAW))
     assert open_pair(pair, Calibration(CAMERA))[0].depth.any()
@@ -254,7 +254,7 @@ def test_one_image_of_another_kind_of_numbers_has_no_unit(tmp_path, color_file, 
     sequence = open_pair(pairs, Calibration(CAMERA))
     assert sequence[0].depth.any()
     with pytest.raises(
-        FrameError, match="(whole.png: depth in whole numbers, and in floats|metres.npy: .* in fl.*whole) "
+        FrameError, match="(whole.png: depth in whole numbers, but in floats|metres.npy: .* in fl.*whole) "
     ):
         sequence[1]
     assert open_pair(pairs, Calibration(CAMERA), Reading(depth_scale=1.0))[1].depth is not None
@@ -274,7 +274,9 @@ def test_floats_that_were_scaled_to_the_farthest_are_refused(tmp_path, color_fil
     """As simulators give them, and tools that draw depth; in metres nothing was farther than one."""
     scaled = write(tmp_path / "depth.npy", METRES / METRES.max())
     silent = Calibration(CAMERA, states_depth_scale=False)
-    with pytest.raises(GavoError, match="depth.npy: depth of exactly 1 at most: scaled .*: say --depth-scale, units"):
+    with pytest.raises(
+        GavoError, match="depth.npy: the largest depth is exactly 1, .* scaled .*: pass --depth-scale, in"
+    ):
         open_pair([(color_file, scaled)], silent)[0]
     sequence = open_pair([(color_file, scaled)], silent, Reading(depth_scale=1 / float(METRES.max())))
     assert np.abs(sequence[0].depth / sequence.camera.depth_scale - METRES).max() < 1e-3
@@ -286,7 +288,9 @@ def test_a_buffer_of_a_renderer_is_refused(tmp_path, color_file, far):
     near = np.float32(0.02)
     buffer = write(tmp_path / "depth.npy", ((far - near * far / METRES) / (far - near)).astype(np.float32))
     silent = Calibration(CAMERA, states_depth_scale=False)
-    with pytest.raises(GavoError, match=r"depth.npy: depth of 0\.9.* to .*: a z-buffer, .* say --depth-scale 1 if"):
+    with pytest.raises(
+        GavoError, match=r"depth.npy: depth of 0\.9.* to .* looks like a z-buffer, .* --depth-scale 1 if"
+    ):
         open_pair([(color_file, buffer)], silent)[0]
     assert open_pair([(color_file, buffer)], silent, Reading(depth_scale=1.0))[0].depth.any()
 
@@ -319,7 +323,7 @@ def test_portrait_images_of_any_size(tmp_path):
     frame, _ = read(color, depth, PORTRAIT)
     np.testing.assert_array_equal(frame.depth, RAW.T)
     assert frame.grey.shape == (64, 48)
-    with pytest.raises(FrameError, match=r"color\.jpg: is 48x64 pixels, the camera's images are 64x48"):
+    with pytest.raises(FrameError, match=r"color\.jpg: is 48x64 pixels, but the camera's images are 64x48"):
         read(color, depth, CAMERA)
 
 
@@ -503,7 +507,7 @@ def test_huge_files_and_images_are_refused_unread(tmp_path):
 
 
 def test_one_file_is_not_both_images(color_file):
-    with pytest.raises(GavoError, match="colour and as depth"):
+    with pytest.raises(GavoError, match="both colour and depth"):
         read(color_file, color_file)
 
 

@@ -43,8 +43,8 @@ def test_depth_in_other_channels_is_refused(tmp_path: Path, depth: np.ndarray, f
     ("content", "words"),
     [
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d\nsize 9\n", r"a pointer of Git LFS.*git lfs pull"),
-        (b"<!DOCTYPE html><html>", "a web page in place of an image: get the file anew"),
-        (b"\n<html><body>404", "a web page in place of an image: get the file anew"),
+        (b"<!DOCTYPE html><html>", "a web page instead of an image: download or copy the file again"),
+        (b"\n<html><body>404", "a web page instead of an image: download or copy the file again"),
         (b"something", r"no image that OpenCV decodes \(begins with b'somethin'\)"),
     ],
 )

@@ -167,11 +167,11 @@ def test_a_folder_with_both_cameras(folder):
 def test_depth_of_another_size_asks_for_its_camera(folder):
     plain = Reading(camera=COLOR)
     with pytest.raises(
-        FrameError, match=r"0\.png: is 160x120 pixels, the colour .* 320x240: to register it, .*\[depth\].* times 0\.5$"
+        FrameError, match=r"0\.png: is 160x120 pixels, but the colour .* 320x240: to register .*\[depth\].* times 0\.5$"
     ):
         open_source(folder, plain)[0]
     other = Calibration(COLOR, replace(COARSE, width=162), COLOR_T_DEPTH)
-    with pytest.raises(GavoError, match=r"0\.png: is 160x120 pixels, the depth camera's images are 162x120"):
+    with pytest.raises(GavoError, match=r"0\.png: is 160x120 pixels, but the depth camera's images are 162x120"):
         open_pair([(folder / "color/0.png", folder / "depth/0.png")], other)[0]
 
 

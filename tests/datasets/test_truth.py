@@ -195,7 +195,7 @@ def test_the_numbers_of_frames_are_the_times_of_frames_to_the_last_bit(folder):
 
 
 FAULTS = {
-    "empty log": ("trajectory.log", "", "holds no trajectory"),
+    "empty log": ("trajectory.log", "", "contains no trajectory"),
     "log of prose": ("trajectory.log", "this is no log\n", "trajectory.log:1: expected three whole numbers"),
     "a log of two numbers": ("trajectory.log", "0 1\n", "trajectory.log:1: expected three whole numbers"),
     "torn log": ("trajectory.log", log(POSES, range(1, 5))[:-90], "trajectory.log:16: expected four rows"),
@@ -204,21 +204,21 @@ FAULTS = {
         log(POSES, range(1, 5)).replace(f"{POSES[1][0][3]:.10f}", ""),
         "trajectory.log:6: expected",
     ),
-    "log of the inverse of size": ("trajectory.log", log(3 * POSES, range(1, 5)), "trajectory.log:1: the pose is no"),
+    "log of the inverse of size": ("trajectory.log", log(3 * POSES, range(1, 5)), "trajectory.log:1: the pose is not"),
     "log on its side": (
         "trajectory.log",
         log(np.swapaxes(POSES, 1, 2), range(1, 5)),
-        "trajectory.log:1: the pose is no",
+        "trajectory.log:1: the pose is not",
     ),
     "log in millimetres of a light year": (
         "trajectory.log",
         "0 0 1\n1 0 0 1e30\n0 1 0 0\n0 0 1 0\n0 0 0 1\n",
         "trajectory.log:1: ",
     ),
-    "a number twice": ("trajectory.log", log(POSES, [1, 2, 2, 3]), "trajectory.log:11: frame 2 is there twice"),
+    "a number twice": ("trajectory.log", log(POSES, [1, 2, 2, 3]), "trajectory.log:11: frame 2 appears twice"),
     "another's numbers": ("trajectory.log", log(POSES[:2], [70, 80]), "trajectory.log: none of its frames"),
     "icl of prose": ("x.gt.freiburg", "x y\n", "x.gt.freiburg:1: expected 8 numbers"),
-    "icl of stamps": ("x.gt.freiburg", "0.5 0 0 0 0 0 0 1\n", "x.gt.freiburg: expected the numbers of frames"),
+    "icl of stamps": ("x.gt.freiburg", "0.5 0 0 0 0 0 0 1\n", "x.gt.freiburg: expected frame numbers"),
     "icl, empty": ("x.gt.freiburg", "", "x.gt.freiburg: holds no trajectory"),
 }
 
@@ -284,7 +284,7 @@ def test_what_a_run_found_is_not_proposed_as_the_truth(tmp_path):
 def test_two_trajectories_of_icl_are_refused(tmp_path):
     icl(tmp_path)
     icl(tmp_path, "livingRoom3.gt.freiburg")
-    with pytest.raises(GavoError, match=r"livingRoom2\.gt\.freiburg and livingRoom3\.gt\.freiburg: leave one"):
+    with pytest.raises(GavoError, match=r"livingRoom2\.gt\.freiburg and livingRoom3\.gt\.freiburg: keep only one"):
         open_source(tmp_path, Reading(camera=CAMERA))
 
 
@@ -299,7 +299,9 @@ def test_what_is_no_pose_is_refused_in_every_dataset(tmp_path, layout, fault):
         np.savetxt(tmp_path / "traj.txt", np.stack([POSES[0], pose]).reshape(-1, 16))
     else:
         np.savetxt(tmp_path / ("frame-000001.pose.txt" if layout == "seven_scenes" else "pose/1.txt"), pose)
-    with pytest.raises(GavoError, match=r"(traj\.txt:2|pose\.txt|pose/1\.txt): the pose is no rotation and shift"):
+    with pytest.raises(
+        GavoError, match=r"(traj\.txt:2|pose\.txt|pose/1\.txt): the pose is not a rotation and translation"
+    ):
         open_source(tmp_path)
 
 
@@ -349,9 +351,9 @@ def test_the_truth_of_a_phone_is_in_order_where_its_stamps_are_not(tmp_path):
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("", "holds no trajectory"),
+        ("", "contains no trajectory"),
         ("1, 2, 3\n", "odometry.csv:1: expected 9"),
-        ("0, 0, 1e200, 0, 0, 0, 0, 0, 1\n", "odometry.csv:1: holds an absurdly large value"),
+        ("0, 0, 1e200, 0, 0, 0, 0, 0, 1\n", "odometry.csv:1: contains an absurdly large value"),
     ],
 )
 def test_faulty_poses_of_a_phone_are_refused(tmp_path, text, fault):
@@ -375,7 +377,7 @@ def test_poses_of_structure_from_motion_are_no_truth(tmp_path):
     change_transforms(tmp_path, colmap_im_id=3)
     sequence = open_source(tmp_path)
     assert sequence.ground_truth is None
-    assert left_out(sequence) == ["transforms.json: its poses are of structure from motion, whose unit is open"]
+    assert left_out(sequence) == ["transforms.json: its poses come from structure from motion, whose unit is unknown"]
 
 
 @pytest.mark.parametrize("entries", [{"file_path": "train/r_0"}, {"transform_matrix": [[float("nan")] * 4] * 4}])
@@ -385,13 +387,13 @@ def test_poses_of_other_images_are_told(tmp_path, entries):
     change_transforms(tmp_path, **entries)
     sequence = open_source(tmp_path)
     assert sequence.ground_truth is None
-    assert left_out(sequence) == ["transforms.json: has no pose of any of these images"]
+    assert left_out(sequence) == ["transforms.json: contains no pose for any of these images"]
 
 
 def test_no_pose_of_nerf_is_refused_with_its_place(tmp_path):
     LAYOUTS["nerf"][1](tmp_path)
     change_transforms(tmp_path, transform_matrix=[[3.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]])
-    with pytest.raises(GavoError, match=r"transforms\.json: frames\[0\]: the pose is no rotation and shift"):
+    with pytest.raises(GavoError, match=r"transforms\.json: frames\[0\]: the pose is not a rotation and translation"):
         open_source(tmp_path)
 
 

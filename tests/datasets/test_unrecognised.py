@@ -23,47 +23,47 @@ def made(folder: Path, *names: str) -> Path:
     [
         ((), "an empty folder, not one of: "),
         (("walk.tar.xz",), r"walk\.tar\.xz: packed: unpack it first \(tar -xf\)"),
-        (("walk.oni", "notes.md"), r"walk\.oni: a recording of OpenNI: write its images and depth"),
+        (("walk.oni", "notes.md"), r"walk\.oni: an OpenNI recording: extract its images and depth"),
         (("walk.MP4", "notes.md"), r"walk\.MP4: a film: write its frames as images"),
-        (("mav0/cam0/data/1.png",), "cam0: a recording as EuRoC has it, of stereo images without depth"),
+        (("mav0/cam0/data/1.png",), "cam0: a recording in the layout of EuRoC: stereo images without depth"),
         (
             ("cam0/data/1.png", "depth0/data/1.png"),
-            "depth0: link its images as depth/, beside rgb/; InteriorNet's, which are lengths of rays",
+            "depth0: link its images as depth/, beside rgb/; InteriorNet's are ray lengths",
         ),
-        (("data.jsonl", "calibration.json", "data.mkv"), "a recording of Spectacular AI: .* sai-cli process, and"),
+        (("data.jsonl", "calibration.json", "data.mkv"), "a Spectacular AI recording: .* sai-cli process, and"),
         (
             ("depth.bin", "pose_intrinsic_imu.json", "rgb.mkv", "rgb_mask.mkv", "exif.json"),
-            r"ScanNet\+\+, its images still packed: write rgb/ and depth/ with iphone/prepare_iphone_data.py",
+            r"ScanNet\+\+ scan, its images still packed: write rgb/ and depth/ with iphone/prepare_iphone_data.py",
         ),
         (("depth.bin", "pose_intrinsic_imu.json", "rgb/frame_000000.jpg"), "still packed: write rgb/ and depth/"),
         (
             tuple(f"{kind}/trajectory_0000/000000.x" for kind in ("color_left", "depth", "stereo_disparity")),
-            r"Mid-Air, whose PNG hold floats of 16 bits: .* 512 / disparity",
+            r"Mid-Air, whose PNG contain 16-bit floats: .* 512 / disparity",
         ),
-        (("rgb/rgb_0000.png", "distance_to_camera/distance_to_camera_0000.npy"), "distance_to_camera: .* of rays"),
+        (("rgb/rgb_0000.png", "distance_to_camera/distance_to_camera_0000.npy"), "distance_to_camera: ray lengths"),
         (
             ("rgb_0000.png", "distance_to_camera_0000.npy"),
-            r"distance_to_camera_0000\.npy: Replicator's lengths of",
+            r"distance_to_camera_0000\.npy: ray lengths from Replicator",
         ),
-        (("photo/0.jpg", "depth/0.png", "instance/0.png"), "depth/: SceneNet RGB-D's are lengths of rays"),
+        (("photo/0.jpg", "depth/0.png", "instance/0.png"), "depth/: SceneNet RGB-D stores ray lengths"),
         (("color.zip", "depth.zip"), r"color\.zip: packed: unpack it first \(unzip\)"),
         (("rgb/0.png", "depth.tar.gz"), r"depth\.tar\.gz: packed: unpack it first \(tar -xf\)"),
-        (("rgb.mp4", "depth.mkv"), r"depth\.mkv: a film of depth: where it has 16 bits, write its frames as images"),
+        (("rgb.mp4", "depth.mkv"), r"depth\.mkv: a film of depth: if it has 16 bits, write its frames as images"),
         (("demo.hdf5", "model/"), r"; demo\.hdf5: arrays in HDF5: write its colour and depth as images"),
-        (("scan.ply", "notes.md"), r"; scan\.ply: a model or a cloud of points, without the images"),
+        (("scan.ply", "notes.md"), r"; scan\.ply: a model or a point cloud, without the images"),
         (("scan.ply", "parts/"), "colour is looked for in "),
-        (("out_Color_1.5.raw", "out_Depth_1.5.raw"), r"1\.5\.raw: images without a head: .* name the \.bag"),
-        (("metadata", "rgbd/0.jpg", "rgbd/0.depth"), r"unzipped, a recording of Record3D: export it"),
-        (("meta/info.json", "data/chunk-000/", "videos/"), "a dataset of LeRobot, of films and tables: of one"),
+        (("out_Color_1.5.raw", "out_Depth_1.5.raw"), r"1\.5\.raw: images without a header: .* pass the \.bag"),
+        (("metadata", "rgbd/0.jpg", "rgbd/0.depth"), r"the contents of a Record3D recording: export it"),
+        (("meta/info.json", "data/chunk-000/", "videos/"), "a LeRobot dataset of films and tables: for one"),
         (
             tuple(f"{i:04}/{kind}.png" for i in range(3) for kind in ("color", "depth")),
-            "3 folders of one frame each, as 0000: if they are of one recording, link their images into rgb/",
+            "3 folders of one frame each, such as 0000: if they belong to one recording, link their images into rgb/",
         ),
         (
             tuple(f"{camera}_{kind}/0.png" for camera in ("front", "wrist") for kind in ("rgb", "depth", "mask")),
-            r"2 folders of colour have one of depth beside them \(front_rgb, wrist_rgb\): link those of one as rgb/",
+            r"2 colour folders have a depth folder beside them \(front_rgb, wrist_rgb\): link one pair as rgb/",
         ),
-        (("d-1.pgm", "r-1.ppm"), "the raw recording of NYU Depth"),
+        (("d-1.pgm", "r-1.ppm"), "a raw recording of NYU Depth"),
         (("rgb/",), "a folder of rgb/, and "),
         (("images/scene_cam_00_geometry_hdf5/frame.0000.depth_meters.hdf5",), "Hypersim, in HDF5: .* lengths of rays"),
         (("scene_cam_00_final_hdf5/x.hdf5", "scene_cam_00_geometry_hdf5/x.hdf5"), "Hypersim, in HDF5"),
@@ -106,10 +106,10 @@ def test_a_folder_is_described(tmp_path: Path, names: tuple[str, ...], words: st
     [
         ("walk.bag.active", "was never closed"),
         ("walk.txt", "a file of 1 bytes, not one of: "),
-        ("nyu_depth_v2_labeled.mat", r"labeled\.mat: arrays of MATLAB: write its colour and depth as images into rgb/"),
-        ("walk.npz", r"walk\.npz: arrays of Python: write its colour and depth"),
+        ("nyu_depth_v2_labeled.mat", r"labeled\.mat: MATLAB arrays: write its colour and depth as images into rgb/"),
+        ("walk.npz", r"walk\.npz: Python arrays: write its colour and depth"),
         ("walk.parquet", r"walk\.parquet: a table: write its colour and depth"),
-        ("walk.USDZ", r"walk\.USDZ: a model or a cloud of points"),
+        ("walk.USDZ", r"walk\.USDZ: a model or a point cloud"),
     ],
 )
 def test_a_file_is_described(tmp_path: Path, name: str, words: str) -> None:
@@ -119,13 +119,13 @@ def test_a_file_is_described(tmp_path: Path, name: str, words: str) -> None:
 
 def test_sources_nearby_are_named(tmp_path: Path) -> None:
     scene = made(tmp_path / "scene", "seq-01/frame-000000.color.png", "seq-01/frame-000000.depth.png")
-    with pytest.raises(GavoError, match="no source itself, but a folder of one: name seq-01"):
+    with pytest.raises(GavoError, match="not a source itself, but a folder of one: pass seq-01"):
         open_source(scene)
     image = scene / "seq-01" / "frame-000000.color.png"
     assert source_around(image) == scene / "seq-01" and source_around(scene) is None
-    with pytest.raises(GavoError, match=f"a file of a source: name its folder, {scene / 'seq-01'}"):
+    with pytest.raises(GavoError, match=f"a file inside a source: pass its folder, {scene / 'seq-01'}"):
         open_source(image)
-    with pytest.raises(GavoError, match=f"a folder inside a source: name the source, {scene / 'seq-01'}"):
+    with pytest.raises(GavoError, match=f"a folder inside a source: pass the source, {scene / 'seq-01'}"):
         open_source(made(scene / "seq-01", "more/notes.md") / "more")
 
 
@@ -133,7 +133,7 @@ def test_a_source_further_down_is_named(tmp_path: Path) -> None:
     """Of a dataset's root the list of all kinds said nothing."""
     folder = made(tmp_path / "root", "notes.md", "kv1/.hidden/0.png", "kv1/sun/notes.md", "scenes/chess/rgb/0.png")
     made(folder, "scenes/chess/depth/0.png")
-    with pytest.raises(GavoError, match="root: no source itself, but one lies further down: name scenes/chess$"):
+    with pytest.raises(GavoError, match="root: not a source itself, but contains one: pass scenes/chess$"):
         open_source(folder)
 
 
@@ -147,7 +147,7 @@ def test_a_source_four_folders_down_is_named(tmp_path: Path) -> None:
 def test_a_link_in_a_circle_is_passed_over(tmp_path: Path) -> None:
     folder = made(tmp_path / "there", "notes.md", "seq-01/frame-000000.color.png", "seq-01/frame-000000.depth.png")
     (folder / "circle").symlink_to("circle")
-    with pytest.raises(GavoError, match="no source itself, but a folder of one: name seq-01"):
+    with pytest.raises(GavoError, match="not a source itself, but a folder of one: pass seq-01"):
         open_source(folder)
 
 

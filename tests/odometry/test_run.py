@@ -25,7 +25,7 @@ def test_what_is_no_sequence_is_refused_by_name():
     frames = list(SyntheticSequence(frames=2, camera=small.CAMERA))
     for wrong in (frames, "fr1_xyz", iter(frames), {}, None, np.zeros(3), SyntheticSequence):
         for call in (run_odometry, lambda wrong: list(track(wrong, small.NEWTON))):
-            with pytest.raises(GavoError, match="a Sequence is needed, not [a-zA-Z_]+: "):
+            with pytest.raises(GavoError, match="expected a Sequence, got [a-zA-Z_]+: "):
                 call(wrong)  # pyright: ignore[reportArgumentType]
     with pytest.raises(GavoError, match="Camera is needed"):
         Odometry("fr1")  # pyright: ignore[reportArgumentType]
@@ -55,10 +55,10 @@ class Own:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"check": None, "name": None}, "Own is no Sequence: it has no name, check"),
+        ({"check": None, "name": None}, "Own is not a Sequence: it has no name, check"),
         ({"timestamps": np.arange(2.0)}, r"Own: timestamps: .*3 frames"),
         ({"camera": "fr1"}, "a Camera is needed"),
-        ({"ground_truth": "groundtruth.txt"}, "Own: ground_truth: a Trajectory or None"),
+        ({"ground_truth": "groundtruth.txt"}, "Own: ground_truth: expected a Trajectory or None"),
         ({}, "frame 0: not there"),
     ],
 )
@@ -74,7 +74,7 @@ def test_what_a_sequence_of_ones_own_lacks_is_named(change, words, monkeypatch):
 def test_a_sequence_of_what_is_no_frame_is_told(wrong: Any) -> None:
     """It ended in an AttributeError in a thread."""
     altered = Altered(Rendered(3, camera=small.CAMERA), lambda index, frame: wrong if index == 1 else frame)
-    with pytest.raises(GavoError, match="a Frame is needed, not (NoneType|str|tuple)"):
+    with pytest.raises(GavoError, match="expected a Frame, got (NoneType|str|tuple)"):
         run_odometry(altered, small.NEWTON)
 
 

@@ -65,7 +65,9 @@ class AirSim(PlainFolder):
         stamps: dict[float, str] = {}
         for one in _taken(path)[0]:
             if stamps.setdefault(one.stamp, one.place) != one.place:
-                raise GavoError(f"{one.place}: has the {STAMP} of {stamps[one.stamp]}: say --rate to do without them")
+                raise GavoError(
+                    f"{one.place}: has the same {STAMP} as {stamps[one.stamp]}: pass --rate to ignore timestamps"
+                )
         return paired_at(color, depth, list(stamps))
 
     @classmethod
@@ -73,15 +75,15 @@ class AirSim(PlainFolder):
         """The camera file in the folder or in its parent."""
         file = own_camera_file(path) or own_camera_file(path.parent)
         if file is None:
-            usual = "with FOV_Degrees of 90, AirSim's own, fx and fy are half the width"
-            raise GavoError(f"{path}: no camera file in it: say --camera, or put a camera.toml into it; {usual}")
+            usual = "with AirSim's default FOV_Degrees of 90, fx and fy are half the width"
+            raise GavoError(f"{path}: no camera file in it: pass --camera, or put a camera.toml into it; {usual}")
         return load_calibration(file, partial(size_of_most, entries), METRES)
 
     @classmethod
     def truth(cls, path: Path, paired: Paired) -> tuple[Trajectory | None, list[str]]:
         """A custom ground truth, if the folder has one."""
         found, unread = super().truth(path, paired)
-        why = f"{RECORDING}: its poses are the vehicle's, and nothing says how the camera lies on it"
+        why = f"{RECORDING}: its poses are the vehicle's, and the camera's place on it is unknown"
         return found, unread if found is not None else [*unread, why]
 
     @classmethod
@@ -120,8 +122,8 @@ def _taken(path: Path) -> tuple[list[_Taken], list[str]]:
     cameras = list(dict.fromkeys(camera for row in own for camera in _cameras(row)))
     if not cameras:
         raise GavoError(
-            f"{path / RECORDING}: no camera has colour (ImageType {SCENE}) and depth of planes in floats ({PLANAR}, "
-            "with PixelsAsFloat), whose PFM are read: record both"
+            f"{path / RECORDING}: no camera has both colour (ImageType {SCENE}) and planar depth in floats ({PLANAR}, "
+            "with PixelsAsFloat, as PFM): record both"
         )
     camera, found = cameras[0], []
     for row in own:
@@ -130,7 +132,7 @@ def _taken(path: Path) -> tuple[list[_Taken], list[str]]:
             found.append(_Taken(row.place, row.stamp, color, depth))
     lacking, others = len(own) - len(found), len(rows) - len(own)
     left_out = [f"images of {other}: not read, those of {camera} are" for other in cameras[1:]]
-    left_out += [f"{lacking} rows: have no colour with depth of {camera}"] * (lacking > 0)
+    left_out += [f"{lacking} rows: no colour with depth of {camera}"] * (lacking > 0)
     return found, left_out + [f"{others} rows: not of {rows[0].vehicle}"] * (others > 0)
 
 
@@ -150,15 +152,17 @@ def _rows(file: Path) -> list[_Row]:
     lines = [(f"{file}:{at}", line.split("\t")) for at, line in text if line.strip()]
     heading = [name.strip() for name in lines[0][1]] if lines else []
     if not {STAMP, IMAGES} <= set(heading):
-        raise GavoError(f"{file}: expected names of columns between tabs first, {STAMP} and {IMAGES} among them")
+        raise GavoError(f"{file}: expected tab-separated column names first, including {STAMP} and {IMAGES}")
     if len(lines) < 2:
-        raise GavoError(f"{file}: has no row: nothing was recorded")
+        raise GavoError(f"{file}: contains no rows: nothing was recorded")
     return [_row(place, heading, fields) for place, fields in lines[1:]]
 
 
 def _row(place: str, heading: list[str], fields: list[str]) -> _Row:
     if len(fields) != len(heading):
-        raise GavoError(f"{place}: expected {len(heading)} values between tabs, found {len(fields)}: remove a torn row")
+        raise GavoError(
+            f"{place}: expected {len(heading)} tab-separated values, found {len(fields)}: remove an incomplete row"
+        )
     values = {name: field.strip() for name, field in zip(heading, fields, strict=True)}
     stamp = values[STAMP]
     if not re.fullmatch(r"\d{1,18}", stamp, re.ASCII):

@@ -141,7 +141,7 @@ class Polycam(PlainFolder):
         ]
         folder = path / cls.CAMERAS
         if not tables:
-            raise GavoError(f"{folder}: has no camera of any of these images: say --camera")
+            raise GavoError(f"{folder}: contains no camera for any of these images: pass --camera")
         color = camera_from_table(folder, common_camera(str(folder), tables), MILLIMETRES)
         return Calibration(color, origin=f"{folder}, the median of {len(tables)}")
 
@@ -181,6 +181,6 @@ def _read_frames(file: Path, written: int, size: int) -> dict[int, dict[str, Any
     for name, frame in read_json_object(file).items():
         number = name.removeprefix("frame_")
         if not number.isdecimal() or not isinstance(frame, dict):
-            raise GavoError(f"{file}: {name[:60]!r}: expected frame_000000 and so on, and what is said of each")
+            raise GavoError(f"{file}: {name[:60]!r}: expected frame_000000 and so on, with the values of each")
         frames[int(number)] = frame
     return frames

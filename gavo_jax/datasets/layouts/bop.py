@@ -65,7 +65,7 @@ def _frames(file: Path) -> dict[int, dict[str, Any]]:
     frames = {}
     for name, frame in read_json_object(file, MAX_JSON_BYTES).items():
         if not name.isdecimal() or not isinstance(frame, dict):
-            raise GavoError(f"{file}: {name[:60]!r}: expected the number of an image, and what is said of it")
+            raise GavoError(f"{file}: {name[:60]!r}: expected the number of an image, with its values")
         frames[int(name)] = frame
     return frames
 
@@ -76,7 +76,7 @@ def _depth_scale(file: Path, frames: list[dict[str, Any]]) -> float:
     scale = scales[0]
     is_number = isinstance(scale, int | float) and not isinstance(scale, bool)
     if not is_number or not scale > 0 or any(other != scale for other in scales):
-        raise GavoError(f"{file}: depth_scale: expected one number of millimetres for all images: say --depth-scale")
+        raise GavoError(f"{file}: depth_scale: expected one number of millimetres for all images: pass --depth-scale")
     return MILLIMETRES / scale
 
 

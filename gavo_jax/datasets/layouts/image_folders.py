@@ -99,9 +99,7 @@ def several_pairs(path: Path) -> str | None:
     if len(pairs) < 2:
         return None
     names = ", ".join(color.name[:60] for (color, *_), _ in pairs[:3]) + ", …" * (len(pairs) > 3)
-    return (
-        f"{len(pairs)} folders of colour have one of depth beside them ({names}): link those of one as rgb/ and depth/"
-    )
+    return f"{len(pairs)} colour folders have a depth folder beside them ({names}): link one pair as rgb/ and depth/"
 
 
 def _is_depth_beside(color: re.Match[str], name: str) -> bool:
@@ -123,7 +121,7 @@ def passed_over(path: Path) -> list[str]:
     words = []
     for kind, some, suffixes in zip(("colour", "depth"), candidates, (COLOR_SUFFIXES, DEPTH_SUFFIXES), strict=True):
         others = [child for child in some[1:] if images_among(child.glob("*"), suffixes)]
-        words += [f"{other.name}/: not read, {kind} is that of {some[0].name}/" for other in others]
+        words += [f"{other.name}/: not read, {kind} comes from {some[0].name}/" for other in others]
     return words
 
 
@@ -136,7 +134,7 @@ def missing_images(path: Path) -> str | None:
         if not images_among(folder.glob("*"), (*suffixes, ".npy")):
             inside = sorted(folder.glob("*"))
             names = ", ".join(child.name[:60] for child in inside[:2]) or "empty"
-            hint = _instead_of_images(kind, folder.name, inside) or f"those end in {', '.join(suffixes)}"
+            hint = _instead_of_images(kind, folder.name, inside) or f"expected names ending in {', '.join(suffixes)}"
             return f"no {kind} images in {folder.name} ({names}): {hint}"
     return None
 
@@ -145,11 +143,11 @@ def _instead_of_images(kind: str, folder: str, inside: list[Path]) -> str:
     """Advice on what lies in a folder in place of images; empty if there is none."""
     endings = {child.suffix.lower() for child in inside}
     if inside and all(child.is_dir() for child in inside):
-        return f"where they lie in {inside[0].name[:60]}/, link that as {folder}/"
+        return f"if they are in {inside[0].name[:60]}/, link it as {folder}/"
     if kind == "colour" and len(inside) == 1 and endings & {*FILMS}:
         return f"a film goes beside that folder, as rgb{inside[0].suffix}"
     if kind == "depth" and endings & {".jpg", ".jpeg", ".webp"}:
-        return "those are pictures of depth: write depth itself, as PNG of 16 bits or TIFF of floats"
+        return "these are pictures of depth: write depth itself, as 16-bit PNG or TIFF of floats"
     return ""
 
 
@@ -206,4 +204,4 @@ def missing_word(path: Path) -> str | None:
     files = images_among(path.glob("*"), ALL_SUFFIXES)
     if not files or len(_with_depth(files)) < len(files):
         return None
-    return f"all images have depth in their names, as {files[0].name[:60]}: those without it are colour"
+    return f"all images have depth in their names, such as {files[0].name[:60]}: only those without it are colour"

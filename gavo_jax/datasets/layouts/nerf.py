@@ -41,7 +41,7 @@ def read_transforms(path: Path, stamps: Mapping[str, float]) -> tuple[Trajectory
     values = read_json(path, MAX_JSON_BYTES)
     frames = [(at, frame) for at, frame in _frames(values) if frame.get("transform_matrix") is not None]
     if any(key in frame for _, frame in frames for key in WITHOUT_SCALE):
-        return None, [f"{path.name}: its poses are of structure from motion, whose unit is open"]
+        return None, [f"{path.name}: its poses come from structure from motion, whose unit is unknown"]
     scale = _scale(path, values) if frames else 1.0
     poses: dict[float, np.ndarray] = {}
     for at, frame in frames:
@@ -51,7 +51,7 @@ def read_transforms(path: Path, stamps: Mapping[str, float]) -> tuple[Trajectory
             pose[:3, 3] /= scale
             poses[stamp] = pose @ FLIP
     if not poses:
-        return None, [f"{path.name}: has no pose of any of these images"] if frames else []
+        return None, [f"{path.name}: contains no pose for any of these images"] if frames else []
     return by_stamp(poses), []
 
 

@@ -50,14 +50,14 @@ class Nerfstudio(PlainFolder):
         file, partners = path / TRANSFORMS, dict[Path, Path]()
         for place, color, depth, _ in _pairs(path):
             if partners.setdefault(color, depth) != depth:
-                raise GavoError(f"{place}: {color.name} is there twice, with {partners[color].name} for its depth, too")
+                raise GavoError(f"{place}: {color.name} appears twice, also with {partners[color].name} as its depth")
         if not partners:
-            raise GavoError(f"{file}: no frame of these names a depth image")
+            raise GavoError(f"{file}: none of its frames names a depth image")
         colors, folders = sorted(partners), {color.parent for color in partners}
         beside, named = (child for folder in folders for child in folder.glob("*")), {*partners, *partners.values()}
         others = [image for image in images_among(beside, COLOR_SUFFIXES) if image not in named]
-        why = f"not named with depth in {TRANSFORMS}"
-        left_out = [f"{len(others)} images: {why}, as {others[0].name}"] if others else []
+        why = f"not listed with depth in {TRANSFORMS}"
+        left_out = [f"{len(others)} images: {why}, such as {others[0].name}"] if others else []
         return colors, [partners[color] for color in colors], left_out
 
     @classmethod
@@ -68,7 +68,7 @@ class Nerfstudio(PlainFolder):
             times = dict(zip(stamps, in_seconds([*stamps.values()], unit), strict=True))
             return paired_at(color, depth, [times[image] for image in color])
         paired = paired_as_told(path, color, depth, reading, seconds)
-        unused = [f"timestamps in {TRANSFORMS}: whole numbers that are no times of a camera"] if stamps else []
+        unused = [f"timestamps in {TRANSFORMS}: whole numbers that cannot be times of a camera"] if stamps else []
         return paired._replace(left_out=paired.left_out + unused)
 
 
@@ -95,9 +95,9 @@ def _stamps(path: Path) -> dict[Path, float]:
     for place, color, value in told:
         stamp = told_stamp(place, value)
         if (other := images.setdefault(stamp, color)) != color:
-            raise GavoError(f"{place}: timestamp: {stamp} is that of {other.name}, too: say --rate to do without them")
+            raise GavoError(f"{place}: timestamp: {stamp} is also {other.name}'s: pass --rate to ignore timestamps")
         if stamps.setdefault(color, stamp) != stamp:
-            raise GavoError(f"{place}: timestamp: {color.name} is there twice, with {stamps[color]}, too")
+            raise GavoError(f"{place}: timestamp: {color.name} appears twice, also with {stamps[color]}")
     return stamps
 
 

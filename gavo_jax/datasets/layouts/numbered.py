@@ -99,7 +99,7 @@ class NumberedFolder(FileSequence):
         numbers = sorted(found.color.keys() & found.depth.keys())
         if not numbers:
             counts = f"{len(found.color)} colour and {len(found.depth)} depth images"
-            raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number")
+            raise GavoError(f"{path}: no frames: {counts}, but no two with the same number")
         times = {} if reading.rate else cls.stamps(path)
         left_out = found.unpaired(len(numbers))
         if times and (untimed := len(numbers) - len(times.keys() & set(numbers))):
@@ -108,7 +108,7 @@ class NumberedFolder(FileSequence):
         times = times or {number: number / rate for number in numbers}
         numbers = [number for number in numbers if number in times]
         if not numbers:
-            raise GavoError(f"{path / cls.STAMPS}: has no row of any frame that is there")
+            raise GavoError(f"{path / cls.STAMPS}: contains no row for any of these frames")
         entries = [Entry(times[number], found.color[number], found.depth[number]) for number in numbers]
         own = partial(cls.calibrate, path, entries, reading)
         calibration = reading.calibration(own, partial(size_of_most, entries), cls.DEPTH_SCALE)
@@ -282,7 +282,7 @@ def _check_identity(file: Path) -> None:
         return
     pose = pose_in(file)
     if pose is None or not np.allclose(pose, np.eye(4), atol=1e-6):
-        raise GavoError(f"{file}: is not the identity: say --camera with a file of both cameras and colour_T_depth")
+        raise GavoError(f"{file}: is not the identity: pass --camera with a file for both cameras and colour_T_depth")
 
 
 def of_matrices(file: Path, matrices: list[Any], size: Size, depth_scale: float) -> Calibration:
@@ -298,7 +298,7 @@ def of_matrices(file: Path, matrices: list[Any], size: Size, depth_scale: float)
         GavoError: there is none, one is no camera matrix, or they differ by more than autofocus explains.
     """
     if not matrices:
-        raise GavoError(f"{file}: has no camera of any frame: say --camera")
+        raise GavoError(f"{file}: contains no camera for any frame: pass --camera")
     tables = [_table_of(file, matrix) for matrix in matrices]
     table = {**common_camera(str(file), tables), "width": size[0], "height": size[1]}
     origin = f"{file}, the median of {len(matrices)}"

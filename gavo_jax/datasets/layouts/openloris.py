@@ -48,7 +48,7 @@ class OpenLoris(TumSequence):
         """Open the folder; its registered depth has to be there."""
         if not (depth := path / cls.LISTS[1]).exists():
             tool = "align_depth.py of openloris-scene-tools"
-            raise GavoError(f"{depth}: no such file: unpack it and its images, or make them by {tool}")
+            raise GavoError(f"{depth}: no such file: unpack it and its images, or create them with {tool}")
         return super().open(path, reading)
 
     @classmethod
@@ -56,7 +56,7 @@ class OpenLoris(TumSequence):
         """The camera file in the folder, else the colour camera of `sensors.yaml`."""
         file = own_camera_file(folder) or folder / cls.SENSORS
         if not file.exists():
-            raise GavoError(f"{file}: no such file, which has the camera: restore it, or say --camera")
+            raise GavoError(f"{file}: no such file, which describes the camera: restore it, or pass --camera")
         return load_calibration(file, partial(size_of_most, entries), MILLIMETRES)
 
     @classmethod
@@ -68,7 +68,7 @@ class OpenLoris(TumSequence):
         base_T_color = _base_T_color(folder / cls.TRANSFORMS)
         if base_T_color is None:
             place = f"{cls.TRANSFORMS} that leads from {BASE} to {OPENLORIS_COLOR}"
-            return None, [f"{TRUTH}: not used: it is of the robot's body, and there is no {place}"]
+            return None, [f"{TRUTH}: not used: it belongs to the robot's body, and there is no {place}"]
         return replace(found, world_T_camera=found.world_T_camera @ base_T_color), []
 
 
@@ -106,5 +106,5 @@ def _transform(place: str, move: Any) -> tuple[str, tuple[str, np.ndarray]]:
     child, parent, matrix = (move[key] for key in keys)
     pose = pose_of(place, [str(value) for value in numbers_of(matrix)])
     if pose is None:
-        raise GavoError(f"{place}: holds numbers that are not finite")
+        raise GavoError(f"{place}: contains numbers that are not finite")
     return child, (parent, pose)

@@ -62,13 +62,13 @@ def paired_by_stamp(path: Path, color: list[Path], depth: list[Path], reading: R
     i, j = associate(first, second, reading.max_difference)
     if len(i) == 0:
         raise GavoError(
-            f"{path}: by their names no colour and depth image lie within {reading.max_difference:g} s of each other: "
-            "say --rate if the names are no stamps"
+            f"{path}: judging by their names, no colour and depth images are within {reading.max_difference:g} s of "
+            "each other: pass --rate if the names are not timestamps"
         )
     entries = [Entry(float(first[a]), color[a], depth[b], float(second[b])) for a, b in zip(i, j, strict=True)]
     left_out = unpaired((len(color), len(depth)), len(i), f"within {reading.max_difference:g} s") + nameless(others)
     if odd := [file for some in timed for file in some.others]:
-        left_out.append(f"{len(odd)} images: names of another form than most, as {odd[0].name}")
+        left_out.append(f"{len(odd)} images: names of another form than most, such as {odd[0].name}")
     of_frames = second.copy()
     of_frames[j] = first[i]
     times = dict(enumerate(of_frames[np.argsort(second, kind="stable")].tolist(), 1))
@@ -101,8 +101,8 @@ def _check_numbers(path: Path, known: _Timed, color: list[Path], depth: list[Pat
         return
     ours, other = (color, depth) if known.files[0] in color else (depth, color)
     raise GavoError(
-        f"{path}: names as {ours[-1].name} are times, and as {other[-1].name}, of the other kind of images, none: "
-        "name both by their times, or say --rate if they are numbers of frames"
+        f"{path}: names such as {ours[-1].name} are times, but those of the other images, such as {other[-1].name}, "
+        "are not: name both by their times, or pass --rate if they are frame numbers"
     )
 
 
@@ -125,8 +125,8 @@ def _timed(files: list[Path], unit: float | None = None) -> _Timed | None:
     odd = [file for some in forms.values() if some is not usual for file in some]
     if len(odd) > MOST_ODD * len(usual):
         raise GavoError(
-            f"{usual[0]}: its name is a time, and {odd[0].name} has another form, as {len(odd)} of {len(files)} have: "
-            "name all alike, or say --rate if the names are numbers of frames"
+            f"{usual[0]}: its name is a time, but {len(odd)} of {len(files)} have another form, such as {odd[0].name}: "
+            "name all the same way, or pass --rate if the names are frame numbers"
         )
     return _Timed(usual, *found, tuple(odd))
 
@@ -147,7 +147,7 @@ def paired_as_told(path: Path, color: list[Path], depth: list[Path], reading: Re
         is_near = own is not None and abs(own - stamp) < reading.max_difference  # else from another clock
         entries.append(Entry(stamp, image, partners[image], own if is_near else None))
     others = sorted(partners.keys() - {entry.color for entry in entries})
-    left_out = [f"{len(others)} frames: names of another form than most, as {others[0].name}"] if others else []
+    left_out = [f"{len(others)} frames: names of another form than most, such as {others[0].name}"] if others else []
     return found._replace(entries=entries, left_out=left_out)
 
 
@@ -163,10 +163,8 @@ def paired_by_number(path: Path, color: list[Path], depth: list[Path], clock: Se
     numbers = sorted(found.color.keys() & found.depth.keys())
     if not numbers:
         counts = f"{len(color)} colour and {len(depth)} depth images"
-        lone = (
-            ": a frame is a file of each kind, with its number in their names" if len(color) == len(depth) == 1 else ""
-        )
-        raise GavoError(f"{path}: no frame: {counts}, of which no two have the same number{lone}")
+        lone = "; the two files of a frame need its number in their names" if len(color) == len(depth) == 1 else ""
+        raise GavoError(f"{path}: no frames: {counts}, but no two with the same number{lone}")
     times = {n: float(clock(np.array(float(n)))) for n in {*numbers, *found.depth}}
     entries = [Entry(times[n], found.color[n], found.depth[n]) for n in numbers]
     return Paired(entries, found.unpaired(len(numbers)), {n: times[n] for n in found.depth}, clock)

@@ -49,7 +49,7 @@ class StrayScan(NumberedFolder):
         if width * cls.FILM[1] != height * cls.FILM[0]:
             film = "x".join(map(str, cls.FILM))
             raise GavoError(
-                f"{path}: images of {width}x{height}, of a film of {film}: say --camera, or do not crop them"
+                f"{path}: images of {width}x{height}, from a film of {film}: pass --camera, or do not crop them"
             )
         found = load_calibration(path / cls.MATRIX, cls.FILM, MILLIMETRES)
         return replace(found, color=found.color.resized(width, height))
@@ -135,11 +135,13 @@ def _clock_of(place: str, stamps: list[Any]) -> Seconds:
     except (TypeError, ValueError):
         times = np.empty(0)
     if times.shape != (len(stamps),) or not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
-        raise GavoError(f"{place}: expected increasing seconds: say --rate to do without them")
+        raise GavoError(f"{place}: expected increasing seconds: pass --rate to ignore timestamps")
 
     def at(numbers: np.ndarray) -> np.ndarray:
         if np.max(numbers) > len(times) - 1:
-            raise GavoError(f"{place}: {len(times)} of them, and a frame {np.max(numbers):.0f}: say --rate instead")
+            raise GavoError(
+                f"{place}: only {len(times)} times, but there is a frame {np.max(numbers):.0f}: pass --rate instead"
+            )
         return np.interp(numbers, np.arange(len(times)), times)
 
     return at
@@ -158,7 +160,7 @@ def _odometry(path: Path) -> dict[int, tuple[float | None, np.ndarray]]:
             continue
         found[at if is_bare else int(values[1])] = None if is_bare else values[0], pose
     if not found:
-        raise GavoError(f"{path}: holds no trajectory (no rows)")
+        raise GavoError(f"{path}: contains no trajectory (no rows)")
     return found
 
 
@@ -166,7 +168,7 @@ def _read_turns(path: Path) -> Trajectory:
     """Read rows of a stamp and camera_T_world (rotation vector and translation) as a trajectory."""
     rows = [values for place, fields in data_rows(path) if (values := numbers_in(place, fields, 7)) is not None]
     if not rows:
-        raise GavoError(f"{path}: holds no trajectory (no rows)")
+        raise GavoError(f"{path}: contains no trajectory (no rows)")
     table = np.array(rows)
     table = table[np.unique(table[:, 0], return_index=True)[1]]
     camera_T_world = np.tile(np.eye(4), (len(table), 1, 1))

@@ -153,7 +153,7 @@ class Open3DFolder(PlainFolder):
 def _unread_times(path: Path) -> list[str]:
     """List files of the frames' times, one line each; they are not read, as their units and order are open."""
     return [
-        f"{name}: times are not read from it: name the images by them, or say --rate"
+        f"{name}: times are not read from it: name the images by them, or pass --rate"
         for name in TIMES
         if (path / name).is_file()
     ]

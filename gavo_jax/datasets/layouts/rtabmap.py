@@ -40,8 +40,8 @@ class RtabMap(PlainFolder):
         files = _cameras(path)
         second = files[0].with_name(f"{entries[0].color.stem}_1.yaml")
         if second in files:
-            how = "cut them apart, and say --camera"
-            raise GavoError(f"{second}: of a second camera, whose images lie beside the first one's: {how}")
+            how = "cut them apart, and pass --camera"
+            raise GavoError(f"{second}: belongs to a second camera, whose images are joined to the first one's: {how}")
         load = partial(
             load_calibration, size=partial(size_of_most, entries), depth_scale=MILLIMETRES, is_rectified=True
         )

@@ -71,7 +71,7 @@ class TartanAir(NumberedFolder):
         width, height = size = size_of_most(entries)
         if size not in SIZES:
             known = " or ".join(f"{width}x{height}" for width, height in SIZES)
-            raise GavoError(f"{path}: images of {width}x{height}, and it was rendered at {known}: say --camera")
+            raise GavoError(f"{path}: images of {width}x{height}, but it was rendered at {known}: pass --camera")
         camera = Camera(FOCAL, FOCAL, width / 2, height / 2, width, height, depth_scale=METRES)
         return Calibration(camera, origin="the one that TartanAir was rendered with")
 

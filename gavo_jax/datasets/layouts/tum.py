@@ -107,7 +107,7 @@ class TumSequence(FileSequence):
             entries, why = _by_place(lists.color, lists.depth), "with a stamp of its own in their row"
         else:
             entries = _associate_lists(lists.color, lists.depth, max_difference)
-            why = f"within {max_difference:g} s that is not another's"
+            why = f"within {max_difference:g} s that is not paired with another"
         if not entries:
             names = " and ".join(self.LISTS)
             raise GavoError(f"{self.folder}: no stamps of {names} within {max_difference:g} s of each other")
@@ -228,21 +228,21 @@ def _read_lists(root: Path, folder: Path, names: tuple[str, str], rate: float | 
         color, depth = _read_pairs(root, both)
     counts = (sum(row.repeated for row in rows) for rows in (color, depth))
     repeated = [
-        f"{count} {kind} images: the stamp of another one"
+        f"{count} {kind} images: the same stamp as another one"
         for count, kind in zip(counts, ("colour", "depth"), strict=True)
         if count
     ]
     color, depth = ([row for row in rows if not row.repeated] for rows in (color, depth))
     are_whole = all(WHOLE.fullmatch(row.written) for row in (*color, *depth))
     if rate and not are_whole:
-        raise GavoError(f"{folder}: --rate is of frames with numbers, and these have stamps")
+        raise GavoError(f"{folder}: --rate applies to numbered frames, but these have timestamps")
     stamps = [row.stamp for row in color]
     unit = _unit(stamps, rate) if are_whole else decimal_unit(stamps) or 1.0
     counts = [row.stamp for row in (*color, *depth)]
     seconds = dict(zip(counts, in_seconds(counts, unit), strict=True))
     for row in (*color, *depth):
         if not abs(seconds[row.stamp]) < MAX_STAMP:
-            raise GavoError(f"{row.place}: not a time stamp: {row.stamp:.15g}: say it in seconds")
+            raise GavoError(f"{row.place}: not a time stamp: {row.stamp:.15g}: expected seconds")
     color, depth = ([row._replace(stamp=seconds[row.stamp]) for row in rows] for rows in (color, depth))
     return _Lists(color, depth, unit, are_paired=both is not None, repeated=repeated)
 
@@ -261,7 +261,7 @@ def _read_pairs(root: Path, path: Path) -> tuple[list[_Row], list[_Row]]:
     pairs = []
     for place, fields in without_heading(data_rows(path, MAX_LIST_BYTES))[1]:
         if len(fields) != 4:
-            aside = ": without this file, images are paired by their names" if len(fields) == 2 else ""
+            aside = "; without this file, images are paired by their names" if len(fields) == 2 else ""
             raise GavoError(f"{place}: expected `stamp path stamp path`, {_found(fields)}{aside}")
         pair = [_row(root, path, place, *fields[at : at + 2]) for at in (0, 2)]
         pairs.append(pair[::-1] if fields[1].count("depth") > fields[3].count("depth") else pair)
@@ -274,7 +274,7 @@ def _read_list(root: Path, path: Path) -> list[_Row]:
     rows: list[_Row] = []
     for place, fields in without_heading(data_rows(path, MAX_LIST_BYTES))[1]:
         if len(fields) != 2:
-            raise GavoError(f"{place}: expected `timestamp path`, of no blanks, {_found(fields)}")
+            raise GavoError(f"{place}: expected `timestamp path`, with no blanks in the path, {_found(fields)}")
         rows.append(_row(root, path, place, *fields))
     return _in_time(path, rows)
 
@@ -310,7 +310,7 @@ def path_below(root: Path, place: str, image: str) -> str:
     except (OSError, RuntimeError, ValueError):
         raise GavoError(f"{place}: not a usable path: {image[:60]!r}") from None
     if not any(found.is_relative_to(root) for found in places) or PureWindowsPath(image).drive:
-        raise GavoError(f"{place}: path leaves the sequence's folder: {image[:200]!r}: {_back(root, image)}")
+        raise GavoError(f"{place}: path leaves the sequence's folder: {image[:200]!r}; {_back(root, image)}")
     return image
 
 
@@ -320,8 +320,8 @@ def _back(root: Path, image: str) -> str:
     ends = ("/".join(parts[at:]) for at in range(1, len(parts)) if ".." not in parts[at:])
     end = next((end for end in ends if (root / end).is_file()), None)
     if end is None:
-        return "link the images' folder into this one (ln -s), and list them by that"
-    return f"it lies here as {end[:200]}: leave {image.removesuffix(end)[:200]!r} out of the list"
+        return "link the images' folder into this one (ln -s), and use that path in the list"
+    return f"it exists here as {end[:200]}: remove the prefix {image.removesuffix(end)[:200]!r} in the list"
 
 
 def _in_time(path: Path, rows: list[_Row]) -> list[_Row]:

@@ -32,7 +32,7 @@ def write_tum(sequence: Sequence, folder: str | Path) -> None:
     require_sequence(sequence, WRITTEN)
     folder = as_path(folder)
     if (folder / "rgb.txt").exists():
-        raise GavoError(f"{folder}: holds a sequence already (rgb.txt)")
+        raise GavoError(f"{folder}: already contains a sequence (rgb.txt)")
     try:
         for part in ("rgb", "depth"):
             (folder / part).mkdir(parents=True, exist_ok=True)
@@ -62,7 +62,7 @@ def _write_frame(frame: Frame, folder: Path) -> tuple[str, str]:
     """Write both images, and return their stamps as formatted for the lists."""
     for name, pixels, dtype in (("grey", frame.grey, np.uint8), ("depth", frame.depth, np.uint16)):
         if pixels.dtype != dtype:
-            raise GavoError(f"{folder}: {name} of {pixels.dtype} does not come back from PNG: round it first")
+            raise GavoError(f"{folder}: {name} of {pixels.dtype} cannot be stored exactly in PNG: round it first")
     delayed = frame.timestamp if frame.depth_timestamp is None else frame.depth_timestamp
     stamp, depth_stamp = (
         np.format_float_positional(seconds, unique=True, min_digits=6) for seconds in (frame.timestamp, delayed)

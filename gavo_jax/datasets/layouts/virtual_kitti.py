@@ -62,7 +62,7 @@ class VirtualKitti(NumberedFolder):
         """The common camera of the frames' rows."""
         file = path / cls.INTRINSICS
         if not file.is_file():
-            raise GavoError(f"{file}: no such file: {TEXTS}; or say --camera")
+            raise GavoError(f"{file}: no such file: {TEXTS}; or pass --camera")
         rows = [numbers_in(place, row, 4) for place, row in _rows(file).values()]
         found = [[[row[0], 0.0, row[2]], [0.0, row[1], row[3]], [0.0, 0.0, 1.0]] for row in rows if row]
         return of_matrices(file, found, size, CENTIMETRES)
@@ -99,12 +99,12 @@ def _rows(file: Path) -> dict[int, tuple[str, list[str]]]:
             continue
         if not (NUMBER.fullmatch(frame) and fields and NUMBER.fullmatch(fields[0])):
             found = " ".join([frame, *fields])[:60]
-            raise GavoError(f"{place}: expected the numbers of a frame and of its camera first, found {found!r}")
+            raise GavoError(f"{place}: expected the numbers of a frame and a camera first, found {found!r}")
         if int(fields[0]) != int(CAMERA[-1]):
             continue
         if int(frame) in rows:
-            raise GavoError(f"{place}: frame {int(frame)} is there twice")
+            raise GavoError(f"{place}: frame {int(frame)} appears twice")
         rows[int(frame)] = place, fields[1:]
     if not rows:
-        raise GavoError(f"{file}: has no row of any frame of {CAMERA}: get the file anew")
+        raise GavoError(f"{file}: contains no row for any frame of {CAMERA}: download or copy it again")
     return rows

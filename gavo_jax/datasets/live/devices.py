@@ -20,9 +20,9 @@ def register_device(name: str, opened: Callable[[], LiveDevice]) -> None:
         GavoError: the name is empty or no text, or `opened` cannot be called.
     """
     if not (isinstance(name, str) and name):
-        raise GavoError(f"live device: name: a word is needed, not {shown(name)}")
+        raise GavoError(f"live device: name: expected a word, got {shown(name)}")
     if not callable(opened):
-        raise GavoError(f"live device {name!r}: what opens it is needed, a function, not {shown(opened)}")
+        raise GavoError(f"live device {name!r}: expected a function that opens it, got {shown(opened)}")
     _devices[name] = opened
 
 

@@ -75,11 +75,12 @@ def frame_of(images: LiveImages, camera: Camera, color: bool = False) -> Frame:
     image, depth = np.asarray(images.color), np.asarray(images.depth)
     if image.dtype != np.uint8 or image.shape not in (size, (*size, 3)):
         raise GavoError(
-            f"colour image is {image.dtype} of shape {image.shape}: uint8 of {size} (grey) or {(*size, 3)} (RGB) needed"
+            f"colour image is {image.dtype} of shape {image.shape}: expected uint8 of {size} (grey) or "
+            f"{(*size, 3)} (RGB)"
         )
     if depth.shape != size or not (depth.dtype.newbyteorder("=") == np.uint16 or depth.dtype.kind == "f"):
         raise GavoError(
-            f"depth image is {depth.dtype} of shape {depth.shape}: uint16 or floats in metres, of {size}, are needed"
+            f"depth image is {depth.dtype} of shape {depth.shape}: expected uint16 or floats in metres, of {size}"
         )
     image, depth = as_array(images.color), as_array(images.depth)
     if depth.dtype != np.uint16:

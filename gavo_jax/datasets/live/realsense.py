@@ -112,4 +112,6 @@ def _import_sdk() -> Any:
     try:
         return import_with_libusb("pyrealsense2")
     except ImportError as error:
-        raise GavoError(f"{NAME}: pyrealsense2 cannot be imported ({error}): install 'gavo-jax[realsense]'") from None
+        raise GavoError(
+            f"{NAME}: pyrealsense2 cannot be imported ({error}): pip install 'gavo-jax[realsense]'"
+        ) from None

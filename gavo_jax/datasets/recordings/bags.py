@@ -70,7 +70,7 @@ class BagSequence:
             unpaired = len(topic.stamps) - topic.aside - topic.repeated - len(i)
             for count, why in (
                 (topic.aside, topic.why),
-                (topic.repeated, "the stamp of one before it"),
+                (topic.repeated, "the same stamp as an earlier one"),
                 (unpaired, f"none of {other} within {reading.max_difference:g} s"),
             ):
                 self.left_out += [f"{count} of {topic.name}: {why}"] * (count > 0)

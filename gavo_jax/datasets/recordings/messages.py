@@ -94,14 +94,14 @@ def color_of(kind: str, message: Any, name: str) -> np.ndarray:
     if kind == COMPRESSED:
         if FILM.search(message.format):
             raise FrameError(
-                f"{name}: a film ({message.format[:40]!r}), of which one image needs others: record JPEG or PNG"
+                f"{name}: a film ({message.format[:40]!r}), in which an image depends on others: record JPEG or PNG"
             )
         image = decode_color(bytes(message.data), name)
         mosaic = _mosaic(message.format)
         return image if mosaic is None else _converted(np.ascontiguousarray(image[..., 0]), mosaic, name)
     pixels = _pixels(message, name)
     if pixels.dtype.kind == "f":
-        raise FrameError(f"{name}: encoding {message.encoding} is no colour")
+        raise FrameError(f"{name}: encoding {message.encoding} is not colour")
     return _converted(pixels, message.encoding, name)
 
 
@@ -119,7 +119,7 @@ def _converted(pixels: np.ndarray, encoding: str, name: str) -> np.ndarray:
         return pixels if conversion is None else cv2.cvtColor(pixels, conversion)
     except cv2.error:
         size = f"{pixels.shape[1]}x{pixels.shape[0]}"
-        raise FrameError(f"{name}: {size} pixels cannot be of encoding {encoding}") from None
+        raise FrameError(f"{name}: {size} pixels cannot have the encoding {encoding}") from None
 
 
 def depth_of(kind: str, message: Any, name: str) -> np.ndarray:
@@ -131,7 +131,7 @@ def depth_of(kind: str, message: Any, name: str) -> np.ndarray:
     if kind == IMAGE:
         if message.encoding not in DEPTH_ENCODINGS:
             raise FrameError(
-                f"{name}: encoding {message.encoding[:40]!r} is no depth: {', '.join(DEPTH_ENCODINGS)} are"
+                f"{name}: encoding {message.encoding[:40]!r} is not depth: expected {', '.join(DEPTH_ENCODINGS)}"
             )
         pixels = _pixels(message, name)
         return pixels if pixels.dtype == np.uint16 else to_float32(pixels)
@@ -141,8 +141,8 @@ def depth_of(kind: str, message: Any, name: str) -> np.ndarray:
         return decode_depth(data, name)
     if not has_header:
         raise FrameError(
-            f"{name}: compressed depth of format {message.format[:40]!r}: not PNG, the only one that is read: record "
-            "that, or raw images"
+            f"{name}: compressed depth of format {message.format[:40]!r}: only PNG is supported; record that, or "
+            "raw images"
         )
     _, slope, offset = struct.unpack_from("<iff", data)
     stored = decode_depth(data[DEPTH_HEADER:], name)
@@ -170,7 +170,9 @@ def _pixels(message: Any, name: str) -> np.ndarray:
     height, width, step = int(message.height), int(message.width), int(message.step)
     if message.encoding in HALVED:
         if height % 2 or width % 2:
-            raise FrameError(f"{name}: {width}x{height} pixels of {message.encoding}, which needs even numbers")
+            raise FrameError(
+                f"{name}: {width}x{height} pixels of {message.encoding}, which needs an even width and height"
+            )
         height = height * 3 // 2
     row = width * channels * dtype.itemsize
     data = np.asarray(message.data, np.uint8)
@@ -229,8 +231,8 @@ def as_taken(place: str, table: dict[str, Any], info: Any, find_size: Callable[[
     if size == whole:
         if any(offset):
             raise GavoError(
-                f"{place}: a region (roi) that begins at {offset[0]} {offset[1]}, and images of the size of the whole, "
-                f"{size[0]}x{size[1]}: whether its numbers are theirs is open: say --camera"
+                f"{place}: a region (roi) starts at {offset[0]} {offset[1]}, but images have the full size, "
+                f"{size[0]}x{size[1]}; it is unclear whether its numbers apply to them: pass --camera"
             )
         return table
     if size != (sides[0] // groups[0], sides[1] // groups[1]):

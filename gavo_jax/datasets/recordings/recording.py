@@ -41,9 +41,9 @@ ZSTD = b"\x28\xb5\x2f\xfd"
 MCAP = b"\x89MCAP0\r\n"
 """First bytes of an MCAP file."""
 FOREIGN = {
-    "": "its header names no profile, and the library reads 'ros2' alone: ros2 bag convert writes it so, if ROS 2's "
-    "messages are in it",
-    "ros1": "its profile is 'ros1', and the library reads 'ros2' alone: name the .bag that it was made from",
+    "": "its header names no profile, and the library reads only 'ros2': convert it with ros2 bag convert, if it "
+    "contains messages of ROS 2",
+    "ros1": "its profile is 'ros1', and the library reads only 'ros2': pass the .bag that it was made from",
 }
 """What to do about an unsupported MCAP, by the profile in its header."""
 FEW = 30
@@ -63,9 +63,9 @@ class Bag:
             raise GavoError(f"{path}: recordings of ROS need the extra [bag]: pip install 'gavo-jax[bag]'") from None
         self.path = path
         if path.is_file() and path.suffix not in SUFFIXES:
-            raise GavoError(f"{path}: the library reads it only as {path.suffix.lower()}: rename it")
+            raise GavoError(f"{path}: the suffix must be in lower case ({path.suffix.lower()}): rename it")
         if path.is_dir() and path.suffix == ".bag":
-            raise GavoError(f"{path}: a folder of ROS 2, which the library takes for a file of ROS 1: rename it")
+            raise GavoError(f"{path}: a ROS 2 folder that the library takes for a ROS 1 file: rename it")
         with legible(path):
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
@@ -79,7 +79,8 @@ class Bag:
         for connection, _, raw in self._reader.messages(connections, start=start):
             if self._reader.is2 and bytes(raw[:4]) == ZSTD:
                 raise GavoError(
-                    f"{self.path}: its messages are compressed (zstd), as its {METADATA} says: name the folder of both"
+                    f"{self.path}: its messages are compressed (zstd), as stated in its {METADATA}: pass the folder "
+                    "that contains both"
                 )
             yield connection.topic, bytes(raw), connection.msgtype
 
@@ -126,8 +127,8 @@ class Bag:
             frames = images[color].frame, images[depth].frame
             if frames[0] == frames[1] or self._between(*frames)[0] is None:
                 raise GavoError(
-                    f"{self.path}: {color} and {depth} are of two cameras, by their names: "
-                    "say --colour-topic and --depth-topic if they are of one"
+                    f"{self.path}: {color} and {depth} belong to two cameras, judging by their names: "
+                    "pass --colour-topic and --depth-topic if they belong to one"
                 )
         return color, depth
 
@@ -135,7 +136,7 @@ class Bag:
         """The cameras of two topics, from the camera_info beside each."""
         found = self._info(color)
         if found is None:
-            raise GavoError(f"{self.path}: no camera_info for {color}: say --camera")
+            raise GavoError(f"{self.path}: no camera_info for {color}: pass --camera")
         name, info = found
         camera = self._camera(name, info, color)
         other = self._info(depth)
@@ -154,9 +155,9 @@ class Bag:
                 return Calibration(camera, origin=name, states_depth_scale=False)
         if color_T_depth is None:
             raise GavoError(
-                f"{self.path}: {depth} is of another camera than {color}, and {FIXED_TOPIC} does not say how they lie, "
-                f"nor does {ANY_TOPIC} without a change: "
-                "say --camera with a file of both cameras ([depth], colour_T_depth), or another --depth-topic"
+                f"{self.path}: {depth} belongs to another camera than {color}, and neither {FIXED_TOPIC} nor "
+                f"{ANY_TOPIC} contains a fixed transform between them: "
+                "pass --camera with a file for both cameras ([depth], colour_T_depth), or another --depth-topic"
             )
         origin = f"{name}, {other[0]} and {where}"
         return Calibration(camera, moved, color_T_depth, origin, states_depth_scale=False)
@@ -168,9 +169,9 @@ class Bag:
         color_T_depth, _ = self._between(frame, other)
         if frame and other and (color_T_depth is None or not np.allclose(color_T_depth, np.eye(4))):
             raise GavoError(
-                f"{self.path}: no camera_info for {topics[1]}, whose images lie in the frame {other[:60]!r} and not in "
-                f"{frame[:60]!r} as {topics[0]}: say --camera with a file of both cameras ([depth], colour_T_depth), "
-                "or of one if depth is registered to colour"
+                f"{self.path}: no camera_info for {topics[1]}, whose images are in the frame {other[:60]!r}, not in "
+                f"{frame[:60]!r} like {topics[0]}: pass --camera with a file for both cameras ([depth], "
+                "colour_T_depth), or for one if depth is registered to colour"
             )
         return Calibration(camera, origin=name, states_depth_scale=False)
 
@@ -212,7 +213,7 @@ class Bag:
     def _camera(self, name: str, info: Any, topic: str) -> Camera:
         place = f"{self.path}: {name}"
         if not is_calibrated(info):
-            raise GavoError(f"{place}: all zero: nobody calibrated the camera: say --camera")
+            raise GavoError(f"{place}: all zero, as the camera was never calibrated: pass --camera")
         with blamed(place):
             table = as_taken(place, camera_table(info, says_rectified(topic)), info, partial(self.size, topic))
             return camera_from_table(place, table, MILLIMETRES)
@@ -240,7 +241,7 @@ def _own_files(reader: Any) -> None:
 @contextlib.contextmanager
 def legible(path: Path, kind: type[GavoError] = GavoError) -> Iterator[None]:
     """Turn the library's exceptions about a damaged recording into a one-line error with advice."""
-    with blamed(f"{path}: not a bag that can be read", lambda words: kind(f"{words}: {_mending(path)}")):
+    with blamed(f"{path}: cannot be read as a bag", lambda words: kind(f"{words}; {_mending(path)}")):
         yield
 
 
@@ -249,10 +250,10 @@ def _mending(path: Path) -> str:
     files = [path] if path.is_file() else list(path.iterdir())
     profiles = {_profile(file) for file in files if file.suffix.lower() == ".mcap"}
     if (profile := next(iter(profiles - {"ros2", None}), None)) is not None:
-        return FOREIGN.get(profile, f"its profile is {profile[:40]!r}, and the library reads 'ros2' alone")
+        return FOREIGN.get(profile, f"its profile is {profile[:40]!r}, and the library reads only 'ros2'")
     kinds = {file.suffix.lower() for file in files}
     tool = "mcap recover" if ".mcap" in kinds else "rosbag reindex" if ".bag" in kinds else "ros2 bag reindex"
-    return f"get it anew, or mend it with {tool}"
+    return f"download or copy it again, or repair it with {tool}"
 
 
 def _profile(file: Path) -> str | None:

@@ -118,5 +118,5 @@ def _aside(topic: Topic, is_used: np.ndarray) -> Topic:
     stamped = np.flatnonzero(np.isfinite(topic.stamps))
     steps = np.diff(topic.stamps[stamped])
     at, seconds = int(stamped[steps.argmin() + 1]), -float(steps.min())
-    why = f"the stamps go back by {seconds:.1f} s at message {at + 1}, and the longest stretch alone is used"
+    why = f"the stamps go back by {seconds:.1f} s at message {at + 1}; only the longest stretch is used"
     return topic._replace(stamps=np.where(aside, np.nan, topic.stamps), aside=int(aside.sum()), why=why)

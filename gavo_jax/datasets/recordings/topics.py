@@ -60,27 +60,25 @@ def choose(path: Path, images: Mapping[str, ImageTopic], color: str | None, dept
         GavoError: a topic is missing, or the choice is ambiguous, within a camera or between several.
     """
     if not images:
-        raise GavoError(f"{path}: holds no images: no topic of {IMAGE} or {COMPRESSED}")
+        raise GavoError(f"{path}: contains no images: no topic of {IMAGE} or {COMPRESSED}")
     for given, option in ((depth, "--depth-topic"), (color, "--colour-topic")):
         if given is not None and given not in images:
-            raise GavoError(f"{path}: {option}: no images on {given!r}: those are on {_listed(images)}")
+            raise GavoError(f"{path}: {option}: no images on {given!r}; there are images on {_listed(images)}")
     colors, depths = _of_color(images, color, depth), _of_depth(images, color, depth)
     if colors and colors == depths:
-        raise GavoError(
-            f"{path}: {colors[0]}: chosen as colour and as depth alike: there are images on {_listed(images)}"
-        )
+        raise GavoError(f"{path}: {colors[0]}: chosen as both colour and depth; there are images on {_listed(images)}")
     cameras = _cameras(colors, depths)
     pairs = [(_preferred(colors, COLOR_NAMES), _preferred(depths, DEPTH_NAMES)) for colors, depths in cameras]
     if len(pairs) > 1:
         told = "; ".join(f"{_listed(colors)} with {_listed(depths)}" for colors, depths in pairs)
-        raise GavoError(f"{path}: {len(pairs)} cameras, {told}: say --colour-topic or --depth-topic of one")
+        raise GavoError(f"{path}: {len(pairs)} cameras, {told}: pass --colour-topic or --depth-topic of one")
     colors, depths = pairs[0]
     for best, what, option in ((depths, "depth", "--depth-topic"), (colors, "colour", "--colour-topic")):
         if len(best) != 1:
             fault = f"{what} images on {_listed(best)}" if best else f"no {what} images"
             if not best and what == "depth":
                 fault += _unread(images)
-            raise GavoError(f"{path}: {fault}; there are images on {_listed(images)}: say {option}")
+            raise GavoError(f"{path}: {fault}; there are images on {_listed(images)}: pass {option}")
     return colors[0], depths[0]
 
 

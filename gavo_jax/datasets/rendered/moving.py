@@ -55,9 +55,9 @@ class MovingPart:
         else:
             poses = np.asarray(self.path(seconds), np.float64)
         if poses.shape != (len(seconds), 4, 4):
-            raise GavoError(f"synthetic: bodies: a path gives {poses.shape} for {len(seconds)} moments, not [n, 4, 4]")
+            raise GavoError(f"synthetic: bodies: a path returns {poses.shape} for {len(seconds)} times, not [n, 4, 4]")
         if not np.all(is_rigid(poses, 1e-6)):
-            raise GavoError("synthetic: bodies: a path gives matrices that are no rigid motions, or not finite")
+            raise GavoError("synthetic: bodies: a path returns matrices that are not finite, or not rigid motions")
         return poses
 
 
@@ -174,16 +174,16 @@ def truths(bodies: Sequence[MovingBody], timestamps: Float[np.ndarray, " frames"
     """
     for body in bodies:
         if not isinstance(body, MovingBody):
-            raise GavoError(f"synthetic: bodies: a MovingBody is needed, not {type(body).__name__}")
+            raise GavoError(f"synthetic: bodies: expected a MovingBody, got {type(body).__name__}")
     if any(not body.parts or not all(part.boxes for part in body.parts) for body in bodies):
         raise GavoError("synthetic: bodies: every body needs a part, and every part a box")
     for box in (box for body in bodies for part in body.parts for box in part.boxes):
         if box.texture not in TEXTURES:
             raise GavoError(f"synthetic: bodies: texture {box.texture!r}: not one of {', '.join(TEXTURES)}")
         if not all(math.isfinite(edge) and 0 < edge <= LARGEST_EDGE for edge in box.size):
-            raise GavoError(f"synthetic: bodies: size {box.size}: must be above 0 and to {LARGEST_EDGE:g} m each")
+            raise GavoError(f"synthetic: bodies: size {box.size}: each must be above 0, and at most {LARGEST_EDGE:g} m")
     if (count := sum(len(body.parts) for body in bodies)) > MOST_PARTS:
-        raise GavoError(f"synthetic: bodies: {count} parts are more than {MOST_PARTS}")
+        raise GavoError(f"synthetic: bodies: must have at most {MOST_PARTS} parts, not {count}")
     seconds, found, last = timestamps - timestamps[0], [], 0
     for label, body in enumerate(bodies, 1):
         labels = tuple(range(last + 1, last + 1 + len(body.parts)))

@@ -49,7 +49,7 @@ class SensorNoise:
         for field in fields(self):
             value = as_number(f"sensor noise: {field.name}", getattr(self, field.name))
             if not (math.isfinite(value) and value >= 0):
-                raise GavoError(f"sensor noise: {field.name}: must be a number from 0, not {value!r}")
+                raise GavoError(f"sensor noise: {field.name}: must be finite, and at least 0, not {value!r}")
         if self.drift_period == 0:
             raise GavoError("sensor noise: drift_period: must be above 0")
 

@@ -92,18 +92,18 @@ class SyntheticSequence:
     ) -> None:
         frames = None if frames is None else _whole("frames", frames, 1)
         if frames is not None and frames > MOST_FRAMES:
-            raise GavoError(f"synthetic: has no more than {MOST_FRAMES} frames, not {frames}")
+            raise GavoError(f"synthetic: frames: must be at most {MOST_FRAMES}, not {frames}")
         seed = _whole("seed", seed, 0)
         rate, speed = None if rate is None else _positive("rate", rate), _positive("speed", speed)
         if not isinstance(noise, SensorNoise):
-            raise GavoError(f"synthetic: noise: a SensorNoise is needed, not {shown(noise)}")
+            raise GavoError(f"synthetic: noise: expected a SensorNoise, got {shown(noise)}")
         camera = DEFAULT_CAMERA if camera is None else camera
         require_camera(camera)
         self._noise, self._color, self._seed = noise, color, seed
         self._camera = camera.rectified()
         low, high = DEPTH_SCALES
         if not low <= self._camera.depth_scale <= high:
-            fault = f"camera.depth_scale: from {low:g} to {high:g}, as 16 bits hold a room's depth, not"
+            fault = f"camera.depth_scale: must be from {low:g} to {high:g}, for a room's depth to fit 16 bits, not"
             raise GavoError(f"synthetic: {fault} {self._camera.depth_scale!r}")
         if trajectory is None:
             self._truth = builtin_path(frames or DEFAULT_FRAMES, rate or DEFAULT_RATE, speed, seed)
@@ -293,7 +293,7 @@ def _as_trajectory(source: Any) -> Trajectory:
     if isinstance(source, Trajectory):
         return source
     if not isinstance(source, str | Path):
-        raise GavoError(f"synthetic: trajectory: a Trajectory or a TUM file is needed, not {shown(source)}")
+        raise GavoError(f"synthetic: trajectory: expected a Trajectory or a TUM file, got {shown(source)}")
     return Trajectory.read_tum(source)
 
 
@@ -302,7 +302,7 @@ def _play(source: Trajectory, frames: int | None, rate: float | None, speed: flo
     if len(source) == 0:
         raise GavoError("synthetic: the trajectory is empty")
     if not (np.isfinite(source.timestamps).all() and np.isfinite(source.world_T_camera).all()):
-        raise GavoError("synthetic: the trajectory holds values that are not finite")
+        raise GavoError("synthetic: the trajectory contains values that are not finite")
     stamps, first = np.unique(source.timestamps, return_index=True)
     start = stamps[0]
     played = Trajectory(start + (stamps - start) / speed, source.world_T_camera[first])
@@ -322,7 +322,7 @@ def _fit_room(path: Trajectory) -> tuple[Trajectory, tuple[float, float], float]
     extent = high - low
     if extent.max() > LARGEST_EXTENT:
         raise GavoError(
-            f"synthetic: the trajectory spans {extent.max():.1f} m: more than {LARGEST_EXTENT:g} m fit no room"
+            f"synthetic: the trajectory spans {extent.max():.1f} m; the largest room is for {LARGEST_EXTENT:g} m"
         )
     need = np.ceil(10 * extent + 1) / 10
     half_extent = (max(_HALF_EXTENT[0], need[0] / 2 + MARGIN_X), max(_HALF_EXTENT[1], need[1] / 2 + MARGIN_Y))

@@ -11,7 +11,7 @@ from gavo_jax.datasets.registry import open_source
 from gavo_jax.errors import GavoError, GavoWarning
 from gavo_jax.inspection import left_out
 
-POSES = "airsim_rec.txt: its poses are the vehicle's, and nothing says how the camera lies on it"
+POSES = "airsim_rec.txt: its poses are the vehicle's, and the camera's place on it is unknown"
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_the_sky_leaves_the_unit_alone(clip):
         sky = np.full((120, 160), 65504.0, np.float32)
         sky[-20:] = 20.0
         pfm_from_top(file, sky)
-    with pytest.warns(GavoWarning, match="than frames of this source hold: depth beyond 65.5 m is left out"):
+    with pytest.warns(GavoWarning, match="than frames of this source can store: depth beyond 65.5 m is left out"):
         depth = opened(clip)[0].depth
     assert (depth[-20:] == 20000).all() and not depth[:-20].any()
 
@@ -98,7 +98,7 @@ def test_what_is_not_read_is_told(clip):
     assert len(opened(clip)) == 2
     assert left_out(opened(clip)) == [
         "images of SimpleFlight_3: not read, those of SimpleFlight_0 are",
-        "1 rows: have no colour with depth of SimpleFlight_0",
+        "1 rows: no colour with depth of SimpleFlight_0",
         "1 rows: not of SimpleFlight",
         POSES,
     ]
@@ -107,7 +107,7 @@ def test_what_is_not_read_is_told(clip):
 def test_a_camera_is_asked_for(clip):
     """Its view is said in settings elsewhere, and may be any."""
     (clip / "camera.toml").unlink()
-    with pytest.raises(GavoError, match="no camera file in it: say --camera.*fx and fy are half the width"):
+    with pytest.raises(GavoError, match="no camera file in it: pass --camera.*fx and fy are half the width"):
         opened(clip)
     assert opened(clip, Reading(camera=CAMERA)).camera.fx == 131
 
@@ -116,25 +116,25 @@ def test_a_camera_is_asked_for(clip):
 def test_depth_that_is_none_is_refused(clip, old, new):
     """A picture of depth, depth along rays, or infrared in place of colour."""
     change(clip, old, new)
-    with pytest.raises(GavoError, match=r"airsim_rec\.txt: no camera has colour \(ImageType 0\) and depth of planes"):
+    with pytest.raises(GavoError, match=r"airsim_rec\.txt: no camera has both colour \(ImageType 0\) and planar depth"):
         opened(clip)
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", ": expected names of columns between tabs first, TimeStamp and ImageFile among them"),
-        ("TimeStamp,ImageFile\n", ": expected names of columns between tabs first"),
-        (f"{AIRSIM_COLUMNS}\n", ": has no row: nothing was recorded"),
-        (f"{AIRSIM_COLUMNS}\na\t1\n", ":2: expected 10 values between tabs, found 2: remove a torn row"),
+        ("", ": expected tab-separated column names first, including TimeStamp and ImageFile"),
+        ("TimeStamp,ImageFile\n", ": expected tab-separated column names first"),
+        (f"{AIRSIM_COLUMNS}\n", ": contains no rows: nothing was recorded"),
+        (f"{AIRSIM_COLUMNS}\na\t1\n", ":2: expected 10 tab-separated values, found 2: remove an incomplete row"),
         ("TimeStamp\tImageFile\nnan\tx.png\n", ":2: TimeStamp: expected milliseconds, found 'nan'"),
         ("TimeStamp\tImageFile\n-1\tx.png\n", ":2: TimeStamp: expected milliseconds, found '-1'"),
-        ("TimeStamp\tImageFile\n1\tx.png\n", ": no camera has colour"),
+        ("TimeStamp\tImageFile\n1\tx.png\n", ": no camera has both colour"),
         (
             "TimeStamp\tImageFile\n" + 2 * "1\timg_0_0_1.png;img_0_1_1.pfm\n",
-            r":3: has the TimeStamp of .*:2: say --rate",
+            r":3: has the same TimeStamp as .*:2: pass --rate",
         ),
-        ("TimeStamp\tImageFile\n1\timg_/../../a_0_1.png;img_/../../a_1_1.pfm\n", ": no camera has colour"),
+        ("TimeStamp\tImageFile\n1\timg_/../../a_0_1.png;img_/../../a_1_1.pfm\n", ": no camera has both colour"),
     ],
 )
 def test_malformed_recordings_are_refused(clip, text, words):

@@ -123,6 +123,6 @@ def test_a_plain_folder_says_nothing_of_what_its_depth_shows(tmp_path):
     LAYOUTS["plain"][1](folder)
     enlarge(folder, 8)
     (folder / "camera.yaml").write_text("fx: 1048\nfy: 1048\ncx: 639.5\ncy: 479.5\nwidth: 1280\nheight: 960\n")
-    with pytest.raises((FrameError, GavoError), match="where it is only of another size"):
+    with pytest.raises((FrameError, GavoError), match="if it differs only in size"):
         open_source(folder)[0]
     assert DEPTHS[0].shape == (120, 160)

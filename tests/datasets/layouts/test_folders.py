@@ -156,14 +156,14 @@ def beside_depth(folder: Path, name: str) -> PlainFolder:
 def test_depth_that_is_registered_to_colour_goes_before_its_own_cameras(folder, name):
     sequence = beside_depth(folder, name)
     assert (sequence[0].depth == 2.0 * sequence.camera.depth_scale).all()
-    assert sequence.left_out == (f"depth/: not read, depth is that of {name}/",)
+    assert sequence.left_out == (f"depth/: not read, depth comes from {name}/",)
 
 
 @pytest.mark.parametrize("name", ["color_to_depth", "depth_to_color_vis", "rgb_aligned", "depth_mask", "depth_rect"])
 def test_other_folders_do_not_go_before_depth(folder, name):
     sequence = beside_depth(folder, name)
     assert all(entry.depth and entry.depth.parent.name == "depth" for entry in sequence.entries)
-    assert sequence.left_out == (("depth_rect/: not read, depth is that of depth/",) if name == "depth_rect" else ())
+    assert sequence.left_out == (("depth_rect/: not read, depth comes from depth/",) if name == "depth_rect" else ())
 
 
 @pytest.mark.parametrize(
@@ -190,9 +190,7 @@ def test_of_two_scenes_in_one_folder_none_is_taken(folder):
         shutil.copytree(folder / ("rgb" if "color" in new else "depth"), folder / new)
     shutil.rmtree(folder / "rgb")
     (folder / "depth").rename(folder / "a-depth")
-    with pytest.raises(
-        GavoError, match=r"2 folders of colour have one of depth beside them \(a-color, b-color\): link"
-    ):
+    with pytest.raises(GavoError, match=r"2 colour folders have a depth folder beside them \(a-color, b-color\): link"):
         open_source(folder)
     (folder / "b-depth").rename(folder / "c-depth")
     sequence = open_source(folder)
@@ -213,7 +211,7 @@ def test_images_that_all_speak_of_depth_are_refused(folder):
     for i in range(2):
         for kind in ("rgb", "map"):
             image(folder / f"sunderdepth_{kind}_{i}.png", GREYS[i])
-    with pytest.raises(GavoError, match=r"all images have depth in their names, as sunderdepth_map_0\.png: those "):
+    with pytest.raises(GavoError, match=r"all images have depth in their names, such as sunderdepth_map_0\.png: "):
         open_source(folder, Reading(camera=CAMERA))
 
 
@@ -222,7 +220,7 @@ def test_floats_that_may_be_centimetres_are_refused(folder, factor):
     wrote(folder, "plain")
     for i, metres in enumerate(METRES):
         image(folder / f"depth/{i}.tiff", (factor * metres).astype(np.float32))
-    with pytest.raises(GavoError, match="in neither metres nor millimetres: say --depth-scale"):
+    with pytest.raises(GavoError, match="fits neither metres nor millimetres: pass --depth-scale"):
         assert open_source(folder).camera
 
 
@@ -241,7 +239,7 @@ def test_what_open3d_says_of_depth_and_lens_counts(folder):
 @pytest.mark.parametrize("row", ["318.6 255.3 517.3 516.5", "517.3 318.6 516.5 255.3"])
 def test_numbers_of_a_camera_in_another_order_are_refused(tmp_path, row):
     (tmp_path / "k.txt").write_text(row)
-    with pytest.raises(GavoError, match="hardly fx fy cx cy"):
+    with pytest.raises(GavoError, match="does not look like fx fy cx cy"):
         load_calibration(tmp_path / "k.txt", (640, 480))
 
 
@@ -312,8 +310,8 @@ def test_frames_keep_their_numbers_where_some_are_missing(folder):
     assert isinstance(sequence, SevenScenes)
     np.testing.assert_allclose(sequence.timestamps, [0, 2 / 30])
     assert sequence.left_out == (
-        "1 colour images: no depth image of the same number",
-        "1 depth images: no colour image of the same number",
+        "1 colour images: no depth image with the same number",
+        "1 depth images: no colour image with the same number",
     )
 
 
@@ -373,7 +371,7 @@ def test_an_image_without_a_number_changes_no_stamp(folder, unit):
     sequence = open_source(folder, Reading(camera=CAMERA))
     np.testing.assert_allclose(np.diff(sequence.timestamps), 0.033, atol=1e-6)
     assert isinstance(sequence, PlainFolder)
-    assert sequence.left_out == ("1 images: no number in their names, as preview.png",)
+    assert sequence.left_out == ("1 images: no number in their names, such as preview.png",)
 
 
 def stamped(folder: Path, color: list[str], depth: list[str]) -> Sequence:
@@ -393,12 +391,12 @@ def test_a_few_names_of_another_form_change_no_stamp(folder, unit, first, stray)
     sequence = stamped(folder, [*names, stray.format(names[3])], names)
     assert isinstance(sequence, PlainFolder) and len(sequence) == 12
     np.testing.assert_allclose(sequence.timestamps, first + np.arange(12) / 30, atol=1e-3)
-    assert sequence.left_out == (f"1 images: names of another form than most, as {stray.format(names[3])}.png",)
+    assert sequence.left_out == (f"1 images: names of another form than most, such as {stray.format(names[3])}.png",)
 
 
 def test_many_names_of_another_form_are_refused(folder):
     names = [f"{'ab'[i > 5]}_{1305031102175 + 33 * i}" for i in range(12)]
-    with pytest.raises(GavoError, match=r"a_\d+\.png: its name is a time, and b_\d+\.png has another form, as 6 of 12"):
+    with pytest.raises(GavoError, match=r"a_\d+\.png: its name is a time, but 6 of 12 have another form, such as b_"):
         stamped(folder, names, names)
 
 
@@ -430,7 +428,7 @@ def test_kinds_of_two_rates_count_the_same(folder):
 
 def test_times_beside_other_numbers_are_refused(folder):
     color = [f"{1000 + round(1000 * i / 30):06}" for i in range(30)]
-    with pytest.raises(GavoError, match=r"clip: names as 001967\.png are times, and as 1039\.png, of the other kind "):
+    with pytest.raises(GavoError, match=r"clip: names such as 001967\.png are times, but .*, such as 1039\.png, "):
         stamped(folder, color, [str(1000 + i) for i in range(40)])
     chosen = ["3", "9", "15", "21", "28", "34"]  # of frames, as the other kind has them all
     shutil.rmtree(folder / "rgb")
@@ -514,8 +512,8 @@ def test_as_many_poses_as_images_are_theirs_in_order(folder, first):
 @pytest.mark.parametrize(
     ("images", "poses", "refused"),
     [
-        (range(1, 21), range(15), "counts 0 to 14, the images 1 to 20: give"),
-        (range(20), range(1, 31), "counts 1 to 30, the images 0 to 19: give"),
+        (range(1, 21), range(15), "poses are numbered 0 to 14, images 1 to 20: give"),
+        (range(20), range(1, 31), "poses are numbered 1 to 30, images 0 to 19: give"),
         (range(1, 21), range(21), None),
         (range(100, 120), range(300), None),
         (range(20), range(5, 20), None),
@@ -535,7 +533,7 @@ def test_a_truth_that_may_be_one_frame_off_is_refused(folder, images, poses, ref
 def test_a_camera_that_is_turned_in_its_device_is_refused(folder):
     wrote(folder, "scannet")
     np.savetxt(folder / "intrinsic/extrinsic_color.txt", np.eye(4) + 0.05 * np.eye(4, k=3))
-    with pytest.raises(GavoError, match=r"extrinsic_color\.txt: is not the identity: say --camera"):
+    with pytest.raises(GavoError, match=r"extrinsic_color\.txt: is not the identity: pass --camera"):
         open_source(folder)
 
 
@@ -545,15 +543,15 @@ def test_images_without_a_number_are_left_out_by_name(folder):
     sequence = open_source(folder)
     assert isinstance(sequence, SevenScenes)
     assert sequence.left_out == (
-        "1 depth images: no colour image of the same number",
-        "1 images: no number in their names, as frame-abc.color.png",
+        "1 depth images: no colour image with the same number",
+        "1 images: no number in their names, such as frame-abc.color.png",
     )
     wrote(folder, "plain")
     image(folder / "depth/legend.png", DEPTHS[0])
     image(folder / "depth/scale.png", DEPTHS[0])
     sequence = open_source(folder)
     assert isinstance(sequence, PlainFolder)
-    assert sequence.left_out == ("2 images: no number in their names, as legend.png",)
+    assert sequence.left_out == ("2 images: no number in their names, such as legend.png",)
 
 
 def test_folders_of_other_names_say_which_are_known(folder):
@@ -610,7 +608,7 @@ def test_an_info_of_a_scan_has_the_cameras(folder):
     assert isinstance(other, SevenScenes) and other.calibration.depth is not None
     assert other.calibration.depth.fx == 140 and other[0].depth.any()
     for text, fault in (
-        (sens(mine, mine, 0.03), "Extrinsic: not the identity"),
+        (sens(mine, mine, 0.03), "Extrinsic: must be the identity"),
         (sens(mine, mine).replace("m_depthWidth", "m_width"), "m_depthWidth"),
         (sens(mine, mine)[:-150], "info.txt of a scan"),
     ):
@@ -707,7 +705,7 @@ def test_one_image_of_another_size_is_not_the_size_of_all(folder, name):
         (folder / "camera.yaml").unlink()
         (folder / "camera.txt").write_text("131 131 79.5 59.5")
         (folder / "camera.txt").rename(folder / "intrinsics.txt")
-    with pytest.raises(GavoError, match=rf"{first}: is 160x60 pixels, the camera's images are 160x120"):
+    with pytest.raises(GavoError, match=rf"{first}: is 160x60 pixels, but the camera's images are 160x120"):
         open_part(str(folder))
 
 
@@ -717,7 +715,7 @@ def test_a_source_without_any_depth_is_refused(folder, raw_value):
     for i in range(4):
         (folder / f"depth/{i}.tiff").unlink()
         image(folder / f"depth/{i}.png", np.full((120, 160), raw_value, np.uint16))
-    with pytest.raises(GavoError, match=r"clip: no reading in the depth of the 4 frames .*--force"):
+    with pytest.raises(GavoError, match=r"clip: no depth readings in the 4 frames .*--force"):
         open_part(str(folder))
     assert len(open_part(str(folder), force=True)) == 4
     image(folder / "depth/3.png", np.full((120, 160), 1500, np.uint16))
@@ -733,7 +731,7 @@ def test_depth_that_falls_nowhere_into_the_image_is_refused(folder, turn):
     mine = "\n".join(f"{k} = {getattr(CAMERA, k)}" for k in ("fx", "fy", "cx", "cy", "width", "height"))
     (folder / "camera.yaml").unlink()
     (folder / "camera.toml").write_text(f"{mine}\ncolour_T_depth = {pose.tolist()}\n[depth]\n{mine}\n")
-    with pytest.raises(GavoError, match=r"clip: of the depth of the 4 frames .* colour_T_depth .*--force"):
+    with pytest.raises(GavoError, match=r"clip: no depth reading of the 4 frames .* colour_T_depth .*--force"):
         open_part(str(folder))
     assert len(open_part(str(folder), force=True)) == 4
 
@@ -750,13 +748,15 @@ def test_what_lacks_images_says_which(folder):
     wrote(folder, "plain")
     for i in range(4):
         (folder / f"rgb/{i}.png").rename(folder / f"rgb/{i}.raw")
-    with pytest.raises(GavoError, match=r"clip: no colour images in rgb \(0\.raw, 1\.raw.*\): those end in \.png, "):
+    with pytest.raises(
+        GavoError, match=r"clip: no colour images in rgb \(0\.raw, 1\.raw.*\): expected .* ending in \.png, "
+    ):
         open_source(folder)
     shutil.rmtree(folder / "depth")
     (folder / "depth").mkdir()
     for i in range(4):
         (folder / f"rgb/{i}.raw").rename(folder / f"rgb/{i}.png")
-    with pytest.raises(GavoError, match=r"clip: no depth images in depth \(empty\): those end in \.png, "):
+    with pytest.raises(GavoError, match=r"clip: no depth images in depth \(empty\): expected names ending in \.png, "):
         open_source(folder)
 
 
@@ -764,7 +764,7 @@ def test_what_lacks_images_says_which(folder):
 def test_a_part_of_a_source_names_its_folder(folder, inside):
     wrote(folder, "plain")
     with pytest.raises(
-        GavoError, match=rf"{inside}: a (file of|folder inside) a source: name (its folder|the source), {folder}$"
+        GavoError, match=rf"{inside}: a (file|folder) inside a source: pass (its folder|the source), {folder}$"
     ):
         open_source(folder / inside)
 
@@ -780,15 +780,15 @@ REFUSED = {
     "a pose of zeros": (
         lambda f: np.savetxt(f / "frame-000001.pose.txt", np.zeros((4, 4))),
         "seven_scenes",
-        "no rotation",
+        "not a rotation",
     ),
-    "no pose": (lambda f: (f / "traj.txt").write_text("# none\n"), "replica", "traj.txt: holds no trajectory"),
+    "no pose": (lambda f: (f / "traj.txt").write_text("# none\n"), "replica", "traj.txt: contains no trajectory"),
     "half a pose": (lambda f: (f / "traj.txt").write_text("1 0 0 0 1\n"), "replica", "traj.txt:1: "),
     "a matrix of text": (lambda f: (f / "camera-intrinsics.txt").write_text("x"), "seven_scenes", "intrinsics.txt: "),
     "no number in common": (
         lambda f: [file.rename(file.with_name(f"7{file.name}")) for file in list((f / "depth").iterdir())],
         "scannet",
-        "no two have the same number",
+        "no two with the same number",
     ),
     "an intrinsics file of something else": (
         lambda f: (f / "camera_intrinsic.json").write_text('{"width": 3}'),
@@ -825,13 +825,13 @@ def test_what_is_no_source_says_what_is_there(tmp_path):
     with pytest.raises(GavoError, match=r"notes\.txt: a file of 5 bytes"):
         open_source(tmp_path / "notes.txt")
     (tmp_path / "walk.bag").write_bytes(b"")
-    with pytest.raises(GavoError, match=r"no source itself, but a folder of one: name walk\.bag"):
+    with pytest.raises(GavoError, match=r"not a source itself, but a folder of one: pass walk\.bag"):
         open_source(tmp_path)
     (tmp_path / "walk.bag").unlink()
     LAYOUTS["replica"][1](tmp_path / "room0")
-    with pytest.raises(GavoError, match=r"traj\.txt: a file of a source: name its folder, .*room0$"):
+    with pytest.raises(GavoError, match=r"traj\.txt: a file inside a source: pass its folder, .*room0$"):
         open_source(tmp_path / "room0/traj.txt")
-    with pytest.raises(GavoError, match=r"no source itself, but a folder of one: name room0"):
+    with pytest.raises(GavoError, match=r"not a source itself, but a folder of one: pass room0"):
         open_source(tmp_path)
 
 
@@ -877,7 +877,7 @@ def test_a_camera_of_colour_is_found_and_that_of_depth_has_to_agree(folder, name
     assert open_source(folder / "scene").camera.fx == 131
     depth.write_text("140 0 79.5 0\n0 140 59.5 0\n0 0 1 0\n0 0 0 1\n")
     with pytest.raises(
-        GavoError, match=r"_color\.txt: intrinsics?_depth\.txt beside it is of another camera: say --cam"
+        GavoError, match=r"_color\.txt: intrinsics?_depth\.txt beside it belongs to another camera: pass --cam"
     ):
         open_source(folder / "scene")
 
@@ -901,7 +901,7 @@ def test_the_camera_of_record3d_is_found_and_no_other_metadata(folder):
         ({"fps": 60}, 10.0, np.arange(4) / 10),
         ({"fps": "fast"}, None, np.arange(4) / 30),
         ({"fps": 60, "frameTimestamps": [7.0, 7.02, 7.1, 7.13, 7.2]}, None, [7.0, 7.02, 7.1, 7.13]),
-        ({"frameTimestamps": [7.0, 7.02]}, None, "2 of them, and a frame 2"),
+        ({"frameTimestamps": [7.0, 7.02]}, None, "only 2 times, but there is a frame 2"),
         ({"frameTimestamps": [7.0, 7.0, 7.1, 7.2]}, None, "expected increasing seconds"),
         ({"frameTimestamps": [7.0, "x", 7.1, 7.2]}, None, "expected increasing seconds"),
     ],
@@ -946,7 +946,7 @@ def test_a_reading_of_no_positive_number_is_refused_by_name(name, value):
 
 
 def test_a_camera_in_place_of_a_reading_is_told(tmp_path):
-    with pytest.raises(GavoError, match=r"a Reading is needed, not str: gavo\.Reading\(camera=…\)"):
+    with pytest.raises(GavoError, match=r"expected a Reading, got str: use gavo\.Reading\(camera=…\)"):
         open_source(tmp_path, "fr1")  # pyright: ignore[reportArgumentType]
 
 
@@ -1013,8 +1013,8 @@ def test_a_faulty_dataset_of_others_is_named(tmp_path, no_plugins, fault):
 @pytest.mark.parametrize(
     ("opened", "words"),
     [
-        (lambda *_: None, "open gives NoneType, no Sequence: no camera, "),
-        (lambda path, reading: [path], "open gives list, no Sequence: no camera, timestamps, name, "),
+        (lambda *_: None, "open returns NoneType, not a Sequence: it has no camera, "),
+        (lambda path, reading: [path], "open returns list, not a Sequence: it has no camera, timestamps, name, "),
         (lambda *_: 1 / 0, "division by zero"),
     ],
 )
@@ -1043,7 +1043,7 @@ class Unbound:
         (type("Empty", (), {}), "Empty: kind"),
         (type("Named", (), {"kind": "named"}), r"Named: has no recognises\(path\)"),
         (type("Half", (), {"kind": "half", "recognises": staticmethod(len)}), r"Half: has no open\(path, reading\)"),
-        (Unbound, r"Unbound: recognises\(path\) cannot be called so: a classmethod is needed"),
+        (Unbound, r"Unbound: cannot be called as recognises\(path\): make it a classmethod"),
     ],
 )
 def test_what_is_no_dataset_is_refused_at_once(no_plugins, dataset, words):

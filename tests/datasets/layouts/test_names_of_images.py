@@ -46,7 +46,7 @@ def test_masks_beside_depth_are_neither(tmp_path: Path) -> None:
             image(tmp_path / f"apple_1_{i}_{kind}.png", GREYS[0])
     image(tmp_path / "apple_1_5.png", GREYS[0])
     sequence = named(tmp_path, "apple_1_{}.png", "apple_1_{}_depth.png")
-    assert len(sequence) == 4 and list(sequence.left_out) == ["1 colour images: no depth image of the same number"]
+    assert len(sequence) == 4 and list(sequence.left_out) == ["1 colour images: no depth image with the same number"]
 
 
 def test_pictures_of_depth_beside_it_are_left_aside(tmp_path: Path) -> None:
@@ -60,11 +60,11 @@ def test_depth_that_azure_kinect_transforms_to_colour_goes_before_its_own(tmp_pa
         image(tmp_path / f"depth/{i}.png", raw(METRES[0][::2, ::2], 1000))
     sequence = named(tmp_path, "color/{}.png", "transformed_depth/{}.png")
     assert sequence[0].depth.shape == (CAMERA.height, CAMERA.width)
-    assert list(sequence.left_out) == ["depth/: not read, depth is that of transformed_depth/"]
+    assert list(sequence.left_out) == ["depth/: not read, depth comes from transformed_depth/"]
 
 
 def test_a_lone_pair_without_a_number_says_how_frames_are_named(tmp_path: Path) -> None:
-    with pytest.raises(GavoError, match=": a frame is a file of each kind, with its number in their names"):
+    with pytest.raises(GavoError, match="; the two files of a frame need its number in their names"):
         named(tmp_path, "shot_Color.png", "shot_Depth.png")
 
 
@@ -74,7 +74,7 @@ def test_a_lone_pair_without_a_number_says_how_frames_are_named(tmp_path: Path) 
         (1, "found 1 channel of 8 bits, a picture of depth: write depth as 16 bits or floats"),
         (
             3,
-            "found 3 channels of 8 bits, a picture of depth or numbers packed into channels, as CARLA's: write",
+            "found 3 channels of 8 bits, a picture of depth or numbers packed into channels, as in CARLA: write",
         ),
     ],
 )

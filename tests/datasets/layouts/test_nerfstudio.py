@@ -123,19 +123,19 @@ def test_stamps_that_count_frames_are_told(folder):
     sequence = opened(stamped(folder, lambda at: at))
     np.testing.assert_allclose(sequence.timestamps, np.arange(1, 5) / 30)
     assert sequence.times_guessed == "names are numbers"
-    assert left_out(sequence) == ["timestamps in transforms.json: whole numbers that are no times of a camera"]
+    assert left_out(sequence) == ["timestamps in transforms.json: whole numbers that cannot be times of a camera"]
 
 
 @pytest.mark.parametrize(
     ("stamp", "fault"),
     [
-        (lambda at: None if at else 1.5, r"frames\[0\]: timestamp: expected seconds, found None: say --rate"),
+        (lambda at: None if at else 1.5, r"frames\[0\]: timestamp: expected seconds, found None: pass --rate"),
         (lambda at: "soon", "timestamp: expected seconds, found 'soon'"),
         (lambda at: True, "timestamp: expected seconds, found True"),
         (lambda at: float("nan"), "timestamp: expected seconds, found nan"),
         (lambda at: 10**400, "timestamp: expected seconds, found"),
         (lambda at: [7.5], r"timestamp: expected seconds, found \[7.5\]"),
-        (lambda at: 7.5, r"timestamp: 7.5 is that of frame_0000\d.png, too: say --rate"),
+        (lambda at: 7.5, r"timestamp: 7.5 is also frame_0000\d.png's: pass --rate"),
     ],
 )
 def test_stamps_that_are_none_are_refused(folder, stamp, fault):
@@ -148,7 +148,7 @@ def test_stamps_that_are_none_are_refused(folder, stamp, fault):
 def test_an_image_with_two_stamps_is_refused(folder):
     stamped(folder, lambda at: at + 0.5)
     change(folder, lambda values: values["frames"].append({**values["frames"][0], "timestamp": 9.5}))
-    with pytest.raises(GavoError, match=r"frames\[4\]: timestamp: frame_00004.png is there twice, with 3.5, too"):
+    with pytest.raises(GavoError, match=r"frames\[4\]: timestamp: frame_00004.png appears twice, also with 3.5"):
         open_source(folder)
 
 
@@ -157,7 +157,7 @@ def test_frames_redefine_the_camera_above_them(folder):
     change(folder, each(lambda frame: frame.update(fl_x=132.0, fl_y=132.0)))
     assert opened(folder).camera.fx == 132 and opened(folder).camera.cx == 79.5
     change(folder, lambda values: values["frames"][0].update(fl_x=140.0))
-    with pytest.raises(GavoError, match=r"transforms\.json: each frame has a camera of its own.*fl_x differs by 8"):
+    with pytest.raises(GavoError, match=r"transforms\.json: the frames have different cameras.*fl_x differs by 8"):
         open_source(folder)
 
 
@@ -172,14 +172,14 @@ def test_images_that_are_not_named_with_depth_are_told(folder):
     change(folder, lambda values: values["frames"].pop())
     change(folder, lambda values: values["frames"][0].pop("depth_file_path"))
     assert len(opened(folder)) == 2
-    assert left_out(opened(folder)) == ["2 images: not named with depth in transforms.json, as frame_00001.png"]
+    assert left_out(opened(folder)) == ["2 images: not listed with depth in transforms.json, such as frame_00001.png"]
 
 
 def test_names_without_a_number_are_told(folder):
     (folder / "images/frame_00004.png").rename(folder / "images/last.png")
     change(folder, lambda values: values["frames"][0].update(file_path="images/last.png"))
     assert len(opened(folder)) == 3
-    assert left_out(opened(folder)) == ["1 frames: names of another form than most, as last.png"]
+    assert left_out(opened(folder)) == ["1 frames: names of another form than most, such as last.png"]
 
 
 def test_a_name_that_no_disk_holds_is_an_image_that_is_missing(folder):
@@ -225,15 +225,15 @@ def test_shifts_that_were_scaled_are_scaled_back(tmp_path, name):
         ({"frames": [{**FRAME, "file_path": "/etc/passwd"}]}, r"frames\[0\]: file_path: path leaves"),
         (
             {"frames": [FRAME, {**FRAME, "depth_file_path": "lidar/7.png"}]},
-            r"frames\[1\]: frame_00001.png is there twice",
+            r"frames\[1\]: frame_00001.png appears twice",
         ),
-        ({"frames": []}, "no frame of these names a depth image"),
+        ({"frames": []}, "none of its frames names a depth image"),
         ({"applied_scale": 0}, "applied_scale: expected a number above 0, found 0"),
         ({"applied_scale": 10**400}, "applied_scale: expected a number above 0"),
         ({"applied_scale": "small"}, "applied_scale: expected a number above 0, found 'small'"),
         (
             {"applied_transform": np.diag([1, 1, -1, 1]).tolist()},
-            "applied_transform: the pose is no rotation and shift",
+            "applied_transform: the pose is not a rotation and translation",
         ),
         ({"applied_transform": "none"}, "applied_transform: expected a pose"),
     ],

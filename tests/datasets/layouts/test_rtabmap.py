@@ -11,7 +11,7 @@ from gavo_jax.datasets.registry import open_source
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory
 
-ESTIMATE = "an estimate of the program that wrote the images, and no truth: gavo evaluate compares a run with it"
+ESTIMATE = "an estimate by the program that wrote the images, not the truth; gavo evaluate can compare a run with it"
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def test_one_camera_may_be_that_of_all_images(clip):
     (clip / f"calib/{RTABMAP_STAMPS[0]}.yaml").rename(clip / "calib.yaml")
     (clip / "calib").rmdir()
     sequence = opened(clip)
-    assert sequence.calibration.origin.startswith(f"{clip / 'calib.yaml'}, its lens left aside")
+    assert sequence.calibration.origin.startswith(f"{clip / 'calib.yaml'}, without its lens")
     assert sequence.camera.fx == 131 and not any(sequence.calibration.color.distortion)
 
 
@@ -85,7 +85,7 @@ def test_focus_may_move_and_lenses_may_not(clip):
     rtabmap_camera(clip / "calib", RTABMAP_STAMPS[0], fx=132.0)
     assert opened(clip).camera.fx == 131
     rtabmap_camera(clip / "calib", RTABMAP_STAMPS[0], fx=140.0)
-    with pytest.raises(GavoError, match=r"calib: each frame has a camera of its own: .* \(fx differs by 9"):
+    with pytest.raises(GavoError, match=r"calib: the frames have different cameras: .* \(fx differs by 9"):
         opened(clip)
 
 
@@ -95,14 +95,14 @@ def test_images_of_several_cameras_are_refused(clip):
         for i in range(2):
             rtabmap_camera(clip / "calib", f"{stamp}_{i}")
         (clip / f"calib/{stamp}.yaml").unlink()
-    with pytest.raises(GavoError, match=rf"calib/{RTABMAP_STAMPS[0]}_1\.yaml: of a second camera, whose images"):
+    with pytest.raises(GavoError, match=rf"calib/{RTABMAP_STAMPS[0]}_1\.yaml: belongs to a second camera, whose "):
         opened(clip)
 
 
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"projection_matrix": {"rows": 3, "cols": 4, "data": [1.0]}}, "a matrix whose rows and columns are not those"),
+        ({"projection_matrix": {"rows": 3, "cols": 4, "data": [1.0]}}, "the rows and columns of a matrix do not match"),
         ({"projection_matrix": 3}, "projection_matrix: must be twelve numbers"),
         ({"camera_matrix": 3}, "Looks like a ROS camera_info|camera_matrix"),
     ],

@@ -66,7 +66,7 @@ def test_depth_is_in_metres_whatever_the_sky_is(clip, camera):
     for file in (clip / f"depth_{camera}").iterdir():
         image(file, sky if file.suffix == ".npy" else packed(sky))
     sequence = opened(clip)
-    with pytest.warns(GavoWarning, match="than frames of this source hold: depth beyond 65.5 m is left out"):
+    with pytest.warns(GavoWarning, match="than frames of this source can store: depth beyond 65.5 m is left out"):
         depth = sequence[0].depth / sequence.camera.depth_scale
     assert (depth[-100:] == 20).all() and not depth[:-100].any()
 
@@ -106,10 +106,10 @@ def test_a_pose_looks_along_the_body_s_first_axis(clip):
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
-        ("", "holds no trajectory"),
+        ("", "contains no trajectory"),
         ("left, then right\n", r"1: expected 7 numbers, found 'left then right'"),
         ("0.0 1 2 3 0 0 0 1\n", r"1: expected 7 numbers, found '0.0 1 2 3 0 0 0 1'"),
-        ("1e30 2 3 0 0 0 1\n", r"1: holds an absurdly large value"),
+        ("1e30 2 3 0 0 0 1\n", r"1: contains an absurdly large value"),
     ],
 )
 def test_malformed_poses_are_refused(clip, rows, words):
@@ -130,7 +130,7 @@ def test_poses_that_are_none_are_left_out(clip):
 
 def test_images_of_another_size_need_a_camera(clip):
     write(clip, "lcam_front", (320, 320))
-    with pytest.raises(GavoError, match="images of 320x320, and it was rendered at 640x480 or 640x640: say --camera"):
+    with pytest.raises(GavoError, match="images of 320x320, but it was rendered at 640x480 or 640x640: pass --camera"):
         opened(clip)
     camera = Camera(160.0, 160.0, 159.5, 159.5, 320, 320)
     sequence = opened(clip, Reading(camera=camera))

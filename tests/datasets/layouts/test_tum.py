@@ -60,7 +60,7 @@ def edit(path: Path, old: str, new: str) -> None:
 
 
 def test_a_unit_that_nobody_says_is_a_guess(folder):
-    """A recorder of another camera writes millimetres: the run took 5000 to a metre for known."""
+    """A recorder of another camera writes millimetres: the run took 5000 per metre for known."""
     numbers = "fx = 50.0\nfy = 50.0\ncx = 31.5\ncy = 23.5\nwidth = 64\nheight = 48\n"
     (folder / "camera.toml").write_text(numbers)
     assert TumSequence(folder).unit_is_assumed
@@ -134,13 +134,13 @@ def test_association_is_one_to_one_and_in_the_order_of_colour_stamps(folder):
 
 
 def test_images_of_stamps_that_were_cut_short_are_left_out_and_counted(folder):
-    """Two of three images went without a word where stamps had one decimal. A row that is there twice is no image."""
+    """Two of three images went without a word where stamps had one decimal. A row that appears twice is no image."""
     for kind in ("rgb", "depth"):
         rows = [f"{100 + i // 3 / 10:.1f} {kind}/{i}.png" for i in range(6)]
         (folder / f"{kind}.txt").write_text("\n".join(rows + rows) + "\n")
     sequence = TumSequence(folder, CAMERA)
     np.testing.assert_allclose(sequence.timestamps, [100.0, 100.1])
-    assert sequence.left_out == tuple(f"4 {kind} images: the stamp of another one" for kind in ("colour", "depth"))
+    assert sequence.left_out == tuple(f"4 {kind} images: the same stamp as another one" for kind in ("colour", "depth"))
 
 
 @pytest.mark.parametrize("kind", ["rgb", "depth"])
@@ -292,7 +292,7 @@ def test_milliseconds_may_have_decimals(folder, first, step, unit):
 def test_milliseconds_with_decimals_are_refused(folder):
     for kind in ("rgb", "depth"):
         edit(folder / f"{kind}.txt", "\n100.", "\n1305031102175.")
-    with pytest.raises(GavoError, match=r"rgb\.txt:2: not a time stamp: 1305031102175.*say it in seconds"):
+    with pytest.raises(GavoError, match=r"rgb\.txt:2: not a time stamp: 1305031102175.*expected seconds"):
         TumSequence(folder, CAMERA)
 
 
@@ -336,7 +336,7 @@ def test_undistortion_belongs_to_the_sequence(folder):
         (lambda f: (f / "rgb.txt").write_bytes(b"\xff\xfe\x00"), "rgb.txt: not a text"),
         (lambda f: edit(f / "depth.txt", "depth/2.png", "depth/2.png\nnot a line at all"), "depth.txt:5: "),
         (lambda f: edit(f / "depth.txt", "depth/2.png", ""), "depth.txt:4: "),
-        (lambda f: edit(f / "depth.txt", "depth/2.png", "depth/2 b.png"), "depth.txt:4: expected `timestamp path`, of"),
+        (lambda f: edit(f / "depth.txt", "depth/2.png", "depth/2 b.png"), "depth.txt:4: expected `timestamp path`"),
         (lambda f: edit(f / "rgb.txt", "100.000000", "nan"), "rgb.txt:2: not a time stamp"),
         (lambda f: edit(f / "rgb.txt", "100.000000", "1_00"), "rgb.txt:2: not a time stamp: '1_00'"),
         (lambda f: edit(f / "rgb.txt", "100.000000", "\u0661\u0662"), "rgb.txt:2: not a time stamp"),
@@ -344,12 +344,18 @@ def test_undistortion_belongs_to_the_sequence(folder):
         (lambda f: edit(f / "rgb.txt", "rgb/3.png", "../clip2/3.png"), "rgb.txt:5: path leaves"),
         (lambda f: edit(f / "rgb.txt", "rgb/3.png", "/etc/passwd"), "rgb.txt:5: path leaves"),
         (lambda f: edit(f / "rgb.txt", "rgb/3.png", "/etc/passwd"), "link the images' folder into this one (ln -s)"),
-        (lambda f: edit(f / "rgb.txt", "rgb/", "/disk/clip/rgb/"), "lies here as rgb/0.png: leave '/disk/clip/' out"),
-        (lambda f: edit(f / "rgb.txt", "rgb/", "D:\\clip\\rgb\\"), "lies here as rgb/0.png: leave 'D:/clip/' out"),
+        (
+            lambda f: edit(f / "rgb.txt", "rgb/", "/disk/clip/rgb/"),
+            "exists here as rgb/0.png: remove the prefix '/disk/clip/'",
+        ),
+        (
+            lambda f: edit(f / "rgb.txt", "rgb/", "D:\\clip\\rgb\\"),
+            "exists here as rgb/0.png: remove the prefix 'D:/clip/'",
+        ),
         (lambda f: edit(f / "rgb.txt", "rgb/3.png", "rgb/\0.png"), "rgb.txt:5: not a usable path"),
         (lambda f: edit(f / "depth.txt", "100.", "900."), "no stamps"),
         (lambda f: (f / "groundtruth.txt").write_text(""), "groundtruth.txt: "),
-        (lambda f: (f / "groundtruth.txt").write_text("1,2,3,4\n"), "found 4 fields; by another name it is not read"),
+        (lambda f: (f / "groundtruth.txt").write_text("1,2,3,4\n"), "found 4 fields; rename it to have it ignored"),
         (lambda f: (f / "groundtruth.txt").write_text("nan nan nan nan nan nan nan nan\n"), "groundtruth.txt:1: "),
     ],
 )
@@ -402,9 +408,9 @@ def test_paths_of_windows_lead_to_the_images(folder):
 @pytest.mark.parametrize(
     ("put", "words"),
     [
-        (lambda path: path.mkdir(), "not a file: restore it, or leave its frame out"),
+        (lambda path: path.mkdir(), "not a file: restore it, or omit its frame"),
         (lambda path: path.symlink_to("elsewhere.png"), r"a link to elsewhere\.png, which is missing: restore"),
-        (lambda path: None, "image is missing: restore it, or leave its frame out"),
+        (lambda path: None, "image is missing: restore it, or omit its frame"),
     ],
 )
 def test_what_is_there_instead_of_an_image_is_said(folder, put, words):

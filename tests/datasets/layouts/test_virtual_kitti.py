@@ -83,26 +83,26 @@ def test_poses_that_are_not_there_are_no_truth(clip):
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
-        ("intrinsic.txt", "", r"intrinsic\.txt: has no row of any frame of Camera_0"),
-        ("intrinsic.txt", "frame cameraID\n0 1 131 131 79.5 59.5\n", "has no row of any frame of Camera_0"),
+        ("intrinsic.txt", "", r"intrinsic\.txt: contains no row for any frame of Camera_0"),
+        ("intrinsic.txt", "frame cameraID\n0 1 131 131 79.5 59.5\n", "contains no row for any frame of Camera_0"),
         ("intrinsic.txt", "0 0 131 131 79.5\n", r"intrinsic\.txt:1: expected 4 numbers, found '131 131 79.5'"),
         ("intrinsic.txt", "0 0 131 131 79.5 a\n", r":1: expected 4 numbers, found '131 131 79.5 a'"),
-        ("intrinsic.txt", "0 0 nan nan nan nan\n", "has no camera of any frame: say --camera"),
-        ("intrinsic.txt", "0 0 131 131 79.5 59.5\n1 0 231 231 79.5 59.5\n", "each frame has a camera of its own"),
-        ("intrinsic.txt", "0\n", r":1: expected the numbers of a frame and of its camera first, found '0'"),
-        ("extrinsic.txt", 5000 * "1" + " 0 1 0 0 0\n", r":1: expected the numbers of a frame and of its camera first"),
-        ("extrinsic.txt", "a b 1 0 0 0\n", r":1: expected the numbers of a frame and of its camera first"),
+        ("intrinsic.txt", "0 0 nan nan nan nan\n", "contains no camera for any frame: pass --camera"),
+        ("intrinsic.txt", "0 0 131 131 79.5 59.5\n1 0 231 231 79.5 59.5\n", "the frames have different cameras"),
+        ("intrinsic.txt", "0\n", r":1: expected the numbers of a frame and a camera first, found '0'"),
+        ("extrinsic.txt", 5000 * "1" + " 0 1 0 0 0\n", r":1: expected the numbers of a frame and a camera first"),
+        ("extrinsic.txt", "a b 1 0 0 0\n", r":1: expected the numbers of a frame and a camera first"),
         (
             "extrinsic.txt",
             "0 0 1 0 0 0 0 1 0 0 0 0 1 0\n",
             r":1: expected a pose of four rows of four numbers",
         ),
-        ("extrinsic.txt", "0 0 2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n", r":1: the pose is no rotation and shift"),
-        ("extrinsic.txt", 2 * "0 0 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n", r":2: frame 0 is there twice"),
+        ("extrinsic.txt", "0 0 2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n", r":1: the pose is not a rotation and translation"),
+        ("extrinsic.txt", 2 * "0 0 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n", r":2: frame 0 appears twice"),
         (
             "extrinsic.txt",
             "frame cameraID\n",
-            r"extrinsic\.txt: has no row of any frame of Camera_0",
+            r"extrinsic\.txt: contains no row for any frame of Camera_0",
         ),
     ],
 )
@@ -121,5 +121,5 @@ def test_images_that_were_not_unpacked_are_asked_for(clip, lacking, other):
 
 def test_texts_that_were_not_unpacked_are_asked_for(clip):
     (clip / "intrinsic.txt").unlink()
-    with pytest.raises(GavoError, match=r"intrinsic\.txt: no such file: it is in .*textgt.*; or say --camera"):
+    with pytest.raises(GavoError, match=r"intrinsic\.txt: no such file: it is in .*textgt.*; or pass --camera"):
         opened(clip)

@@ -58,4 +58,4 @@ def test_a_list_of_times_that_is_not_read_is_told(tmp_path: Path, name: str) -> 
     (tmp_path / name).write_text("0.0\n0.1\n0.2\n0.3\n")
     sequence = open_source(tmp_path)
     said = [line for line in getattr(sequence, "left_out", ()) if line.startswith(name)]
-    assert said == [f"{name}: times are not read from it: name the images by them, or say --rate"]
+    assert said == [f"{name}: times are not read from it: name the images by them, or pass --rate"]

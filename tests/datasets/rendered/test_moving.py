@@ -157,8 +157,8 @@ def test_a_written_folder_tells_the_truth(moving: SyntheticSequence, tmp_path) -
     [
         (-1, "bodies"),
         (1.5, "bodies: a whole number is needed, not 1.5"),
-        ("2", "bodies: a MovingBody is needed, not str"),
-        ([1], "bodies: a MovingBody is needed, not int"),
+        ("2", "bodies: expected a MovingBody, got str"),
+        ([1], "bodies: expected a MovingBody, got int"),
         ([MovingBody("whole", 1)], "bodies: 'int' object is not iterable"),  # pyright: ignore[reportArgumentType]
         ([box("held", (1.0, 1.0, 1.0), None)], "bodies: 'NoneType' object"),  # pyright: ignore[reportArgumentType]
         (MOST_BODIES + 1, f"to {MOST_BODIES}"),
