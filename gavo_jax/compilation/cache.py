@@ -46,7 +46,7 @@ def why_not_private(folder: Path) -> str | None:
     for parent in folder.resolve().parents:
         mode = parent.stat().st_mode
         if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
-            return f"others can put something else in its place: {parent} is open to them"
+            return f"others can put something else in its place, as they can write to {parent}"
     within_reach = (stat.S_IWGRP if top.st_mode & stat.S_IXGRP else 0) | (
         stat.S_IWOTH if top.st_mode & stat.S_IXOTH else 0
     )
@@ -95,6 +95,6 @@ def _is_private(folder: Path) -> bool:
     except OSError:
         return False
     if fault:
-        words = f"{folder}: {fault}, and what is kept there is run: nothing is kept; remove it, or close it to others"
+        words = f"{folder}: {fault}, and programs kept there are run, so none is kept; remove it, or close it to others"
         warnings.warn(words, GavoWarning, stacklevel=4)
     return fault is None

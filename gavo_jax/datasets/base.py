@@ -68,7 +68,7 @@ def as_seconds(name: str, stamp: Any) -> float:
     Raises:
         GavoError: It is not a single number but, say, text or a date.
     """
-    return as_number(name, stamp, "seconds are needed, a number")
+    return as_number(name, stamp, "expected seconds as a number")
 
 
 def index_at(timestamps: Float[np.ndarray, " n"], stamp: float) -> int:

@@ -155,7 +155,7 @@ def test_a_written_folder_tells_the_truth(moving: SyntheticSequence, tmp_path) -
     ("bodies", "word"),
     [
         (-1, "bodies"),
-        (1.5, "bodies: a whole number is needed, not 1.5"),
+        (1.5, "bodies: expected a whole number, got 1.5"),
         ("2", "bodies: a MovingBody is needed, not str"),
         ([1], "bodies: a MovingBody is needed, not int"),
         ([MovingBody("whole", 1)], "bodies: 'int' object is not iterable"),  # pyright: ignore[reportArgumentType]
