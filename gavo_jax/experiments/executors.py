@@ -97,7 +97,7 @@ class RayExecutor:
         self._wanted = {"CPU": min(options.cpus, resources.get("CPU", 1.0)), "GPU": gpus}
         for name, amount in self._wanted.items():
             if amount > resources.get(name, 0.0):
-                raise GavoError(f"--executor ray: a batch takes {amount:g} {name}, the cluster has fewer")
+                raise GavoError(f"--executor ray: a batch takes {amount:g} {name}, but the cluster has fewer")
 
     def slots(self) -> int:
         """Return how many batches the cluster's processors and GPUs can run at the same time."""

@@ -92,7 +92,7 @@ class Table:
         """
         parquet = _parquet()
         if not self.done():
-            raise GavoError(f"{self.folder}: no results of an experiment")
+            raise GavoError(f"{self.folder}: contains no experiment results")
         rows = []
         for run in sorted(self.done()):
             path = self.folder / f"{run}{SUFFIX}"
@@ -112,10 +112,10 @@ def _fault(rows: list[dict[str, Any]], run: str) -> str:
         return f"{len(rows)} rows"
     (row,) = rows
     if row["run"] != run:
-        return "of another run than its name says"
+        return "belongs to another run than its name says"
     for name in NEEDED:
         if row[name] is None:
-            return f"without {name}"
+            return f"{name} is missing"
     if not row[FRAMES_PER_SECOND] > 0:
         return f"{FRAMES_PER_SECOND} of {row[FRAMES_PER_SECOND]}"
     for name in MAPPINGS:
@@ -124,7 +124,7 @@ def _fault(rows: list[dict[str, Any]], run: str) -> str:
         except (ValueError, RecursionError):
             value = None
         if not isinstance(value, dict):
-            return f"{name} is no JSON object"
+            return f"{name} is not a JSON object"
     return ""
 
 

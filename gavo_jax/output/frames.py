@@ -88,7 +88,7 @@ def _require_pose(folder: Path, stamp: str, poses: Mapping[str, int], found: Map
     """Raise GavoError where a frame of frames.csv has no pose."""
     for name, stamps in ((TRAJECTORY, poses), (ODOMETRY, found)):
         if stamp not in stamps:
-            raise GavoError(f"{folder}: {name} and {FRAMES} are not of the same run: no pose at {stamp}")
+            raise GavoError(f"{folder}: {name} and {FRAMES} are not from the same run: no pose at {stamp}")
 
 
 def _read_step(
@@ -187,10 +187,10 @@ def read_run(folder: str | Path) -> RecordedRun:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        fault = "no folder" if folder.exists() else "no such folder"
-        raise GavoError(f"{folder}: {fault}: name the output folder of a run")
+        fault = "not a folder" if folder.exists() else "no such folder"
+        raise GavoError(f"{folder}: {fault}: pass the output folder of a run")
     if not (folder / CONFIG).exists():
-        raise GavoError(f"{folder}: no output folder of `gavo run`: it holds no {CONFIG}")
+        raise GavoError(f"{folder}: not an output folder of `gavo run`: it contains no {CONFIG}")
     config = read_json_object(folder / CONFIG)
     # a run with loops that was killed has the poses as they were found alone
     is_cut_short = not (folder / TRAJECTORY).exists() and (folder / ODOMETRY).exists()

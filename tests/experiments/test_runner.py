@@ -219,7 +219,7 @@ def test_an_interrupted_study_says_how_it_goes_on(tuned, tmp_path, capsys, monke
 
     monkeypatch.setattr("gavo_jax.cli.tune.search", stopped)
     assert main(["tune", str(tuned), "--output", str(tmp_path / "study")]) == 130
-    assert capsys.readouterr().err == "gavo: interrupted: the same command goes on from there\n"
+    assert capsys.readouterr().err == "gavo: interrupted: the same command resumes from there\n"
 
 
 def test_the_setting_says_whether_a_range_is_of_whole_numbers(tuned, tmp_path, monkeypatch):
