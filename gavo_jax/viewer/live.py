@@ -54,7 +54,7 @@ WINDOW_SECONDS = 1.0
 """After which a window that found no screen would have ended."""
 PATIENCE = 60.0
 """Seconds for the server to start, and for the last frames to arrive."""
-NOT_STARTED = "Rerun does not start"
+NOT_STARTED = "Rerun did not start"
 GUARD = """
 import os, signal, subprocess, sys, threading
 server = subprocess.Popen([sys.executable, "-m", "rerun", "--serve-web", *sys.argv[1:]], stdin=subprocess.DEVNULL)
@@ -85,7 +85,7 @@ def make_viewer(mode: ViewerMode, recording: Path) -> Viewer:
     if mode == "spawn" and not _has_screen():
         raise GavoError("--viewer spawn: no screen here: use --viewer web or --viewer save")
     if mode == "save" and recording.is_dir():
-        raise GavoError(f"{recording}: cannot be written: a folder lies there")
+        raise GavoError(f"{recording}: cannot be written: it is a folder")
     return RerunViewer(mode, recording)
 
 
@@ -173,7 +173,7 @@ class RerunViewer(Viewer):
         """Serve the browser until Ctrl-C; a window of its own and a file need nothing."""
         if not self.url:
             return
-        print("the viewer stays until Ctrl-C ends it", flush=True)
+        print("the viewer stays open until Ctrl-C", flush=True)
         try:
             while True:
                 time.sleep(1.0)
@@ -206,7 +206,7 @@ class RerunViewer(Viewer):
             return
         except RuntimeError:
             self._process.terminate()
-        raise RuntimeError("Rerun's window does not open on this screen: use --viewer web or --viewer save")
+        raise RuntimeError("Rerun's window did not open on this screen: use --viewer web or --viewer save")
 
     def _serve(self, stream: RecordingStream) -> None:
         """Serve page and data by a process of Rerun's command: unlike its Python calls, it can keep to this machine."""
