@@ -41,16 +41,16 @@ class Source:
     """Take every S-th frame."""
     depth_scale: Annotated[float | None, arg(metavar="U", help_behavior_hint="(default: the camera's)")] = None
     """Raw depth units per metre: 5000 for TUM, 1000 for millimetres."""
-    rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="(default: by the stamps, else 30)")] = None
-    """Frames per second, where frames have numbers and no stamps."""
+    rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="(default: from the stamps, else 30)")] = None
+    """Frames per second, if frames have numbers but no stamps."""
     colour_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: found by type)")] = None
-    """Of the colour images of a recording."""
+    """Topic of the colour images in a recording."""
     depth_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: found by type)")] = None
-    """Of the depth images of a recording."""
+    """Topic of the depth images in a recording."""
     moving: Annotated[int, arg(metavar="N")] = 0
     """Bodies that move through the synthetic room: a box, a walking figure, more boxes."""
     force: bool = False
-    """Go on although the depth looks as if its scale were wrong."""
+    """Continue even if the depth scale looks wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,21 +60,21 @@ class SearchOptions:
     method: Annotated[
         Method,
         arg(
-            help="Genetic algorithm, particle swarm, Gauss-Newton (the classic method), Adam. Further names are those "
-            "of installed packages."
+            help="Genetic algorithm, particle swarm, Gauss-Newton (the classic method), Adam. Installed "
+            "packages may add others."
         ),
     ] = "ga"
     preset: Annotated[
         PresetName,
         arg(
             help="Settings: the project's own, the paper's, for speed, for large motions. Each of the four methods has "
-            "all of them; a method of another package has default alone."
+            "all of them; a method of another package has only default."
         ),
     ] = "default"
     settings: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the preset's)")] = None
-    """Settings from a TOML file, or from config.json of an earlier run; the method and preset that it names count."""
+    """Settings from a TOML file, or from config.json of an earlier run; its method and preset apply."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=VALUE", help_behavior_hint="(repeatable)")] = ()
-    """A single setting, as alignment.points=2400 or solver.population.4=32."""
+    """A single setting, such as alignment.points=2400 or solver.population.4=32."""
 
 
 @dataclass(frozen=True)
@@ -83,12 +83,12 @@ class Run(SearchOptions, Source):
 
     sequence: Annotated[Positional[str], arg(metavar="[SEQUENCE]", help=f"{SOURCE}. {LIVE}.")] = "synthetic"
     seed: Annotated[int, arg(metavar="S")] = 0
-    """Of the method's randomness: the same seed gives the same trajectory, bit for bit."""
+    """Seed of the method's randomness: the same seed gives the same trajectory, bit for bit."""
     reference: Annotated[
         Literal["previous", "keyframe"] | None,
         arg(metavar="{previous,keyframe}", help_behavior_hint="(default: the preset's)"),
     ] = None
-    """What a frame is aligned to: the previous frame alone, or it and a keyframe at once."""
+    """What a frame is aligned to: only the previous frame, or that and a keyframe at once."""
     on_lost: Annotated[
         Literal["hold", "predict", "stop"] | None,
         arg(metavar="{hold,predict,stop}", help_behavior_hint="(default: the preset's)"),
@@ -98,45 +98,45 @@ class Run(SearchOptions, Source):
         Literal["off", "mask", "track"] | None,
         arg(metavar="{off,mask,track}", help_behavior_hint="(default: the preset's)"),
     ] = None
-    """What moves on its own: part of the scene; left out of the search; or that, and its own motion found, too."""
+    """Treat what moves on its own as part of the scene, leave it out of the search, or also find its own motion."""
     output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/SEQUENCE-METHOD-PRESET)")] = (
         None
     )
-    """Folder for trajectory.txt, metrics.json, frames.csv, config.json and figures; an earlier run's are replaced."""
+    """Folder for trajectory.txt, metrics.json, frames.csv, config.json and figures; earlier ones are replaced."""
     trajectory_format: Annotated[str, arg(metavar="{tum,kitti,euroc,json,bag}")] = "tum"
-    """In what else the trajectory is written, with commas between: KITTI, EuRoC's CSV, JSON, a ROS 2 bag of poses."""
+    """Further formats of the trajectory, separated by commas: KITTI, EuRoC's CSV, JSON, a ROS 2 bag of poses."""
     map: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(.ply, .pcd or .obj; default: none)")] = None
-    """Write what was seen, in colour: a cloud, or into .obj a mesh; needs the extra [map]."""
+    """Write what was seen, in colour: a cloud, or a mesh for .obj; needs the extra [map]."""
     map_shape: Annotated[
         Literal["cloud", "mesh"] | None, arg(metavar="{cloud,mesh}", help_behavior_hint="(default: the ending's)")
     ] = None
-    """What the map is."""
+    """Shape of the map."""
     voxel: Annotated[float, arg(metavar="M")] = 0.01
     """Side of the map's voxels, metres."""
     loops: bool = False
-    """Keep a map of keyframes and correct the trajectory where the camera comes back to a place (docs/loops.md)."""
+    """Keep a map of keyframes and correct the trajectory where the camera returns to a place (docs/loops.md)."""
     viewer: Literal["none", "spawn", "web", "save"] = "none"
     """Watch the search: in a window of Rerun, in a browser, or later, from run.rrd in the output folder."""
     resume: bool = False
-    """Go on with the run in the folder where it was cut short; the options have to be the same."""
+    """Continue the interrupted run in the output folder; the options must be the same."""
     strict: bool = False
     """Exit with status 3 if any pair was lost."""
 
 
 @dataclass(frozen=True)
 class Compare(Source):
-    """Run several methods, other libraries' too, over the same frames: one table, comparison.json, figures."""
+    """Run several methods, including other libraries', over the same frames: one table, comparison.json, figures."""
 
     methods: Annotated[
         str,
         arg(
             metavar="NAME,NAME,…",
-            help="Methods of `gavo run` and odometries of other libraries, with commas between: "
-            f"{', '.join((*METHODS, *PEERS))}. A method may have a preset of its own: ga:fast.",
+            help="Methods of `gavo run` and odometries of other libraries, separated by commas: "
+            f"{', '.join((*METHODS, *PEERS))}. A method may have its own preset: ga:fast.",
         ),
     ] = "ga,pso,gauss-newton,adam,opencv-rgb,opencv-rgbd"
     preset: PresetName = "default"
-    """Settings of the project's own methods, where none is named with one."""
+    """Preset of the project's own methods, unless given with the method."""
     seeds: Annotated[int, arg(metavar="N")] = 1
     """Run each random method with seeds 0 to N - 1; table and figures show the run of median drift."""
     output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/SEQUENCE-compare-PRESET)")] = (
@@ -147,7 +147,7 @@ class Compare(Source):
 
 @dataclass(frozen=True)
 class View:
-    """Look at a finished run: its trajectory, curves and, where the sequence is still there, images and truth."""
+    """Look at a finished run: its trajectory, curves and, if the sequence is still there, images and truth."""
 
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
     """The output folder of `gavo run`."""
@@ -156,7 +156,7 @@ class View:
     search: Annotated[
         bool,
         arg(
-            help="Do not track the frames once more: paths and images are there at once, without the particles.",
+            help="Do not track the frames again: paths and images appear at once, without the particles.",
             help_behavior_hint="(default: they are tracked)",
         ),
     ] = True
@@ -175,7 +175,7 @@ class Align(SearchOptions):
     depth1: Annotated[Positional[Path], arg(metavar="DEPTH1")]
     """Depth image of the target frame."""
     camera: Annotated[str, arg(metavar="{auto,fr1,fr2,fr3,FILE}")] = "auto"
-    """As in `gavo run`; auto: the camera of the source that RGB0 is of, else the file beside it or one folder up."""
+    """As in `gavo run`; auto: the camera of the source containing RGB0, else the file beside it or one folder up."""
     depth_scale: Annotated[float | None, arg(metavar="U", help_behavior_hint="(default: the camera's)")] = None
     """As in `gavo run`."""
     force: bool = False
@@ -211,37 +211,37 @@ class Experiment:
     folder: Annotated[Positional[Path | None], arg(metavar="[DIR]", help_behavior_hint="(with report)")] = None
     """Folder of results to report on."""
     executor: Literal["local", "ray"] = "local"
-    """This process, or the Ray cluster that RAY_ADDRESS names (else one that is started here)."""
+    """This process, or the Ray cluster named by RAY_ADDRESS (else one started here)."""
     dry_run: bool = False
     """Print the plan and stop."""
     output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the file's, else runs/NAME)")] = (
         None
     )
-    """Folder for the table and the report; what it has already is not run again."""
+    """Folder for the table and the report; runs that it already has are not repeated."""
     markdown: bool = False
     """Print the tables of the report as Markdown."""
 
 
 @dataclass(frozen=True)
 class Download:
-    """Get a sequence of the TUM RGB-D benchmark and unpack it."""
+    """Download and unpack a sequence of the TUM RGB-D benchmark."""
 
     name: Annotated[Positional[str], arg(metavar="NAME")]
-    """As fr1_xyz, freiburg1_xyz or rgbd_dataset_freiburg1_xyz."""
+    """Such as fr1_xyz, freiburg1_xyz or rgbd_dataset_freiburg1_xyz."""
     to: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: GAVO_DATA, else data)")] = None
     """Folder that receives the sequence's folder."""
 
 
 @dataclass(frozen=True)
 class Tune:
-    """Search settings for small drift and little time at once, by Optuna; the result is a Pareto front."""
+    """Search for settings with both small drift and short time, using Optuna; the result is a Pareto front."""
 
     file: Annotated[Positional[Path], arg(metavar="FILE.toml")]
-    """What is tuned, over which sequences (docs/experiments.md)."""
+    """What to tune, and on which sequences (docs/experiments.md)."""
     trials: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the file's, else 50)")] = None
-    """Trials that the study is to hold in the end; it goes on from those it has."""
+    """Total number of trials in the study, including those it already has."""
     storage: Annotated[str | None, arg(metavar="URL", help_behavior_hint="(default: SQLite in --output)")] = None
-    """Any storage of Optuna; several machines may share one."""
+    """Any Optuna storage; several machines may share one."""
     output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the file's, else runs/NAME)")] = (
         None
     )
@@ -250,12 +250,12 @@ class Tune:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Versions, machine and settings for an issue report; whether this JAX computes right numbers, and how fast."""
+    """Print versions, machine and settings for an issue report; check whether JAX computes correctly, and how fast."""
 
 
 @dataclass(frozen=True)
 class Inspect(Source):
-    """Say what a source is: frames, rates, sizes, depth, camera, truth, and which frames cannot be used, and why."""
+    """Describe a source: frames, rates, sizes, depth, camera, truth, and which frames cannot be used, and why."""
 
     json: bool = False
     """Print it as JSON."""
@@ -263,17 +263,17 @@ class Inspect(Source):
 
 @dataclass(frozen=True)
 class Calibrate(Source):
-    """Find from the images alone what a source does not say of its camera, and write a camera file.
+    """Find from the images alone what a source does not say about its camera, and write a camera file.
 
     Shutter readout, delay of depth and depth scale; the source's camera is what the search starts from.
     """
 
     focal_length: bool = False
-    """Find the focal length, too."""
+    """Also find the focal length."""
     principal_point: bool = False
-    """Find the principal point, too."""
+    """Also find the principal point."""
     output: Annotated[Path | None, arg(metavar="FILE.toml", help_behavior_hint="(default: camera.toml)")] = None
-    """The camera file, for --camera. One that is there already is replaced only where it is named."""
+    """The camera file, for --camera; an existing file is replaced only if it is named here."""
     json: bool = False
     """Print what was found as JSON."""
 
