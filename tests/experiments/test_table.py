@@ -68,7 +68,7 @@ def test_a_torn_file_is_named_and_a_partial_one_is_no_row(tmp_path):
 
 
 def test_no_table(tmp_path):
-    with pytest.raises(GavoError, match="no results"):
+    with pytest.raises(GavoError, match="no experiment results"):
         Table(tmp_path / "nowhere").read()
 
 
