@@ -150,7 +150,7 @@ def test_command(small, tmp_path, capsys):
     "arguments, words",
     [
         (["experiment", "nowhere.toml"], ["nowhere.toml", "no such file"]),
-        (["experiment", "report", "nowhere"], ["nowhere", "no results"]),
+        (["experiment", "report", "nowhere"], ["nowhere", "no experiment results"]),
         (["experiment", "report"], ["which folder"]),
         (["experiment", "report", "nowhere", "--dry-run"], ["report", "--dry-run"]),
         (["experiment", "report", "nowhere", "--output", "there"], ["report", "--output"]),
