@@ -151,7 +151,7 @@ def test_command(small, tmp_path, capsys):
     [
         (["experiment", "nowhere.toml"], ["nowhere.toml", "no such file"]),
         (["experiment", "report", "nowhere"], ["nowhere", "no experiment results"]),
-        (["experiment", "report"], ["which folder"]),
+        (["experiment", "report"], ["no folder given"]),
         (["experiment", "report", "nowhere", "--dry-run"], ["report", "--dry-run"]),
         (["experiment", "report", "nowhere", "--output", "there"], ["report", "--output"]),
         (["tune", "nowhere.toml"], ["nowhere.toml"]),
