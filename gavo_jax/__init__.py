@@ -78,5 +78,5 @@ def __getattr__(name: str) -> object:
     """Return a deprecated name of version 0.1, with a warning."""
     if name not in _RENAMED:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    warnings.warn(f"gavo_jax.{name} is gavo_jax.{_RENAMED[name]} now", DeprecationWarning, stacklevel=2)
+    warnings.warn(f"gavo_jax.{name} is now gavo_jax.{_RENAMED[name]}", DeprecationWarning, stacklevel=2)
     return globals()[_RENAMED[name]]

@@ -66,12 +66,12 @@ class Camera:
     def __post_init__(self):
         for name in ("width", "height"):
             if not isinstance(size := getattr(self, name), int | np.integer) or size < 0:
-                raise GavoError(f"camera: {name}: a whole number of pixels is needed, not {size!r}")
+                raise GavoError(f"camera: {name}: expected a whole number of pixels, got {size!r}")
         for name in ("fx", "fy", "depth_scale", "readout"):
             value = getattr(self, name)
             if isinstance(value, int | float | np.integer | np.floating) and value < 0:
-                what = "seconds from 0 on are" if name == "readout" else "a positive number is"
-                raise GavoError(f"camera: {name}: {what} needed, not {value!r}")
+                what = "seconds of at least 0" if name == "readout" else "a positive number"
+                raise GavoError(f"camera: {name}: expected {what}, got {value!r}")
 
     @staticmethod
     def preset(name: str) -> "Camera":
@@ -194,7 +194,7 @@ class Camera:
 
     def _check_size(self, image: np.ndarray) -> None:
         if image.shape[:2] != (self.height, self.width):
-            raise ValueError(f"image of {self.height} rows and {self.width} columns expected, got {image.shape[:2]}")
+            raise ValueError(f"expected an image of {self.height} rows and {self.width} columns, got {image.shape[:2]}")
 
 
 def to_pixels(camera: Any, x: Any, y: Any, per_depth: Any = 1.0) -> tuple[Any, Any]:
@@ -252,22 +252,22 @@ def require_camera(camera: Camera) -> None:
         GavoError: It is not: a side has fewer than `MIN_SIDE` pixels or a focal length is not positive, say.
     """
     if not isinstance(camera, Camera):
-        raise GavoError(f"a Camera is needed, not {type(camera).__name__}: gavo.Camera(…) or gavo.Camera.preset(name)")
+        raise GavoError(f"expected a Camera, got {type(camera).__name__}: gavo.Camera(…) or gavo.Camera.preset(name)")
     for name, least in {"fx": 0.0, "fy": 0.0, "cx": -np.inf, "cy": -np.inf, "depth_scale": 0.0}.items():
         if not (_is_number(value := getattr(camera, name)) and value > least):
-            raise GavoError(f"camera: {name}: a {'positive ' * (least == 0)}number is needed, not {value!r}")
+            raise GavoError(f"camera: {name}: expected a {'positive ' * (least == 0)}number, got {value!r}")
     if not (_is_number(camera.readout) and camera.readout >= 0):
-        raise GavoError(f"camera: readout: seconds from 0 on are needed, not {camera.readout!r}")
+        raise GavoError(f"camera: readout: expected seconds of at least 0, got {camera.readout!r}")
     if camera.model not in DISTORTION_COUNTS:
-        raise GavoError(f"camera: model: one of {', '.join(DISTORTION_COUNTS)} is needed, not {camera.model!r}")
+        raise GavoError(f"camera: model: expected one of {', '.join(DISTORTION_COUNTS)}, got {camera.model!r}")
     counts, distortion = DISTORTION_COUNTS[camera.model], camera.distortion
     if not (isinstance(distortion, tuple) and len(distortion) in (0, *counts) and all(map(_is_number, distortion))):
         raise GavoError(
-            f"camera: distortion: a tuple of {', '.join(map(str, counts))} numbers is needed, not {distortion!r}"
+            f"camera: distortion: expected a tuple of {', '.join(map(str, counts))} numbers, got {distortion!r}"
         )
     if min(camera.width, camera.height) < MIN_SIDE:
         size = f"{camera.width}x{camera.height}"
-        raise GavoError(f"images of {size} are too small: the search needs {MIN_SIDE} pixels a side at least")
+        raise GavoError(f"images of {size} are too small: the search needs at least {MIN_SIDE} pixels per side")
 
 
 def _is_number(value: Any) -> bool:
@@ -333,6 +333,6 @@ def preset_for_sequence(name: str) -> str:
         if match := re.search(pattern, name.lower()):
             return match.expand(preset)
     raise GavoError(
-        f"no camera known for sequence {name!r}: put a camera.toml into it, or say which (--camera, camera=): "
+        f"no camera known for sequence {name!r}: put a camera.toml into it, or pass one (--camera, camera=): "
         f"{', '.join(PRESETS)} or a file"
     )

@@ -73,7 +73,7 @@ def shown(value: Any) -> str:
     try:
         return cutter.repr(value)
     except ValueError:  # Python refuses to print integers of thousands of digits
-        return f"a {type(value).__name__} of too many digits"
+        return f"{type(value).__name__} with too many digits"
 
 
 def number(text: str) -> float:
@@ -87,14 +87,14 @@ def number(text: str) -> float:
     return math.nan if OF_WINDOWS.fullmatch(text) else float(text)
 
 
-def as_number(name: str, value: Any, needed: str = "a number is needed") -> float:
+def as_number(name: str, value: Any, needed: str = "expected a number") -> float:
     """Return a value as a Python float.
 
     Raises:
         GavoError: It is not a single real number, but text or a list, say.
     """
     if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf":
-        raise GavoError(f"{name}: {needed}, not {shown(value)}")
+        raise GavoError(f"{name}: {needed}, got {shown(value)}")
     return float(value)
 
 
@@ -107,7 +107,7 @@ def as_whole(name: str, value: Any) -> int:
     try:
         return operator.index(value)
     except TypeError:
-        raise GavoError(f"{name}: a whole number is needed, not {shown(value)}") from None
+        raise GavoError(f"{name}: expected a whole number, got {shown(value)}") from None
 
 
 def as_path(value: Any) -> Path:
@@ -119,7 +119,7 @@ def as_path(value: Any) -> Path:
     try:
         return Path(value)
     except TypeError:
-        raise GavoError(f"the path of a file or folder is needed, not {shown(value)}") from None
+        raise GavoError(f"expected the path of a file or folder, got {shown(value)}") from None
 
 
 def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
@@ -140,7 +140,7 @@ def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
     except OSError as error:
         raise GavoError(f"{path}: cannot be read: {error.strerror or error}") from None
     except UnicodeDecodeError:
-        raise GavoError(f"{path}: not a text file (UTF-8): write it in UTF-8, if it is text") from None
+        raise GavoError(f"{path}: not a text file (UTF-8): if it is text, save it as UTF-8") from None
     except ValueError as error:
         if isinstance(error, GavoError):
             raise
@@ -164,7 +164,7 @@ def read_json_object(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> dict[
     """
     values = read_json(path, max_bytes)
     if not isinstance(values, dict):
-        raise GavoError(f"{path}: not a JSON object: names and values are needed")
+        raise GavoError(f"{path}: not a JSON object: expected names and values")
     return values
 
 

@@ -250,7 +250,9 @@ def _relative_pose_error_seconds(estimate: Trajectory, truth: Trajectory, delta:
     end = end[start]
     apart = float(np.median(np.diff(estimate.timestamps)))
     if len(start) == 0 and apart > delta:
-        raise GavoError(f"relative pose error: no two poses about {delta:g} s apart: the estimate's are {apart:.3g} s")
+        raise GavoError(
+            f"relative pose error: no two poses about {delta:g} s apart: those of the estimate are {apart:.3g} s apart"
+        )
     nearest = _closest_index(truth.timestamps, estimate.timestamps)
     estimate = _in_segments_of_both(estimate, truth.segments[nearest])
     far = np.abs(truth.timestamps[nearest] - estimate.timestamps) > 2 * np.median(np.diff(truth.timestamps))
@@ -312,7 +314,9 @@ def _associated(
     """Return the estimate's associated poses, in the order of their stamps, and the true `world_T_camera`."""
     i, j = associate(estimate.timestamps, truth.timestamps, max_difference)
     if len(i) < 2:
-        raise GavoError(f"{what}: only {len(i)} poses of estimate and ground truth within {max_difference:g} s")
+        raise GavoError(
+            f"{what}: only {len(i)} poses of estimate and ground truth are within {max_difference:g} s of each other"
+        )
     return _in_segments_of_both(estimate[i], truth.segments[j]), truth.world_T_camera[j]
 
 

@@ -39,7 +39,7 @@ def summary(sequence: Sequence) -> str:
 
 def unit_of(source: Facts) -> str:
     """Return the unit of depth in words, marked as a guess if nothing states it."""
-    doubt = ", a guess: say --depth-scale if it is another" if source["depth_unit_assumed"] else ""
+    doubt = ", a guess: pass --depth-scale if it is another" if source["depth_unit_assumed"] else ""
     return f"{name_of_unit(source['depth_units_per_metre'])}{doubt}"
 
 

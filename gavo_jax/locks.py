@@ -41,7 +41,9 @@ def hold(folder: str | Path, name: str = LOCK) -> Iterator[None]:
     except OSError as error:
         raise GavoError(f"{path}: cannot be written: {error.strerror or error}") from None
     if held is None:
-        raise GavoError(f"{folder}: in use by another gavo{_holder(path)}: wait for its end, or name another folder")
+        raise GavoError(
+            f"{folder}: in use by another gavo{_holder(path)}: wait until it ends, or choose another folder"
+        )
     try:
         yield
     finally:
@@ -86,7 +88,7 @@ def _open(path: Path) -> int:
 
 def _lock(path: Path, file: int) -> bool:
     if fcntl is None:
-        warnings.warn(f"{path.parent}: not locked on this system: let nothing else write there", GavoWarning, 5)
+        warnings.warn(f"{path.parent}: not locked on this system: let nothing else write to it", GavoWarning, 5)
         return True
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -94,7 +96,7 @@ def _lock(path: Path, file: int) -> bool:
         return False
     except OSError as error:
         reason = error.strerror or error
-        warnings.warn(f"{path.parent}: cannot be locked ({reason}): let nothing else write there", GavoWarning, 5)
+        warnings.warn(f"{path.parent}: cannot be locked ({reason}): let nothing else write to it", GavoWarning, 5)
     return True
 
 

@@ -140,9 +140,9 @@ def register(method: str, settings: Settings | Solver) -> None:
         GavoError: The name is a built-in method's or malformed, or `settings` is None.
     """
     if not isinstance(method, str) or method in METHODS or not re.fullmatch("[a-z][a-z0-9-]*", method):
-        raise GavoError(f"{method!r} cannot be the name of a method of one's own")
+        raise GavoError(f"{method!r} cannot be the name of a custom method")
     if settings is None:
-        raise GavoError(f"{method}: settings or a solver are needed, not None")
+        raise GavoError(f"{method}: expected settings or a solver, got None")
     _registered[method] = as_settings(settings)
 
 

@@ -168,9 +168,9 @@ class MapBuilder:
         image, core = self._open3d.t.geometry.Image, self._open3d.core
         world_T_camera = np.asarray(world_T_camera)
         if world_T_camera.shape != (4, 4) or not is_rigid(world_T_camera):
-            raise GavoError("world_T_camera: a 4x4 matrix is needed, of a rotation and a translation")
+            raise GavoError("world_T_camera: expected a 4x4 matrix of a rotation and a translation")
         if frame.color is not None and np.shape(frame.color) != (*np.shape(frame.grey), 3):
-            raise FrameError(f"color image is of shape {np.shape(frame.color)}: {(*np.shape(frame.grey), 3)} is needed")
+            raise FrameError(f"color image has shape {np.shape(frame.color)}: expected {(*np.shape(frame.grey), 3)}")
         frame = rectified(frame, self._recorded)
         metres = np.asarray(frame.depth, np.float32) / np.float32(self.camera.depth_scale)
         metres = np.where((metres > 0) & (metres < self.farthest), metres, np.float32(0))
@@ -277,8 +277,8 @@ class LiveMap:
         return self._builder.extract(shape, _left_out(self._reasons))
 
 
-LOST, GUESSED, DOUBTED = "lost", "of a pose that was guessed", "of doubtful depth"
-ELSEWHERE, UNREADABLE = "of another segment", "unreadable"
+LOST, GUESSED, DOUBTED = "lost", "with a guessed pose", "with doubtful depth"
+ELSEWHERE, UNREADABLE = "in another segment", "unreadable"
 
 
 def _why_not(step: Step) -> str | None:
@@ -387,19 +387,19 @@ def check_map(path: str | Path, shape: Shape | None = None) -> Shape:
     """
     ending = as_path(path).suffix.lower()
     if ending not in ENDINGS:
-        raise GavoError(f"{path}: a map ends in {', '.join(ENDINGS)}, not in {ending or 'nothing'!r}")
+        raise GavoError(f"{path}: the name of a map must end in {', '.join(ENDINGS)}, not in {ending or 'nothing'!r}")
     if shape is None:
         return ENDINGS[ending][0]
     if shape not in ENDINGS[ending]:
         fit = [other for other, holds in ENDINGS.items() if shape in holds]
-        raise GavoError(f"{path}: {ending} holds no {shape}: {' or '.join(fit)} does")
+        raise GavoError(f"{path}: {ending} cannot store a {shape}: use {' or '.join(fit)}")
     return shape
 
 
 def check_shape(shape: str) -> None:
     """Raise GavoError for an unknown shape."""
     if shape not in ("cloud", "mesh"):
-        raise GavoError(f"shape: cloud or mesh, not {shape!r}")
+        raise GavoError(f"shape: must be cloud or mesh, not {shape!r}")
 
 
 def check_voxel(voxel: float) -> None:

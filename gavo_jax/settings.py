@@ -163,7 +163,7 @@ def as_settings(value: "Settings | Solver | None" = None, solver: Solver | None 
         raise TypeError(f"neither Settings nor a solver: {type(value).__name__}")
     given = {name: part for name, part in parts.items() if part is not None}
     if given:
-        words = "options and alignment are parts of the settings now: dataclasses.replace(settings, alignment=…)"
+        words = "options and alignment are now parts of the settings: dataclasses.replace(settings, alignment=…)"
         warnings.warn(words, DeprecationWarning, stacklevel=4)  # the caller's caller, past a wrapper
     if solver is not None:
         given["solver"] = solver

@@ -108,7 +108,7 @@ def _require_kind(where: str, value: Any, kind: Any, default: Any) -> None:
     if not any(fits(value) for _, fits in kinds):
         *others, last = (words for words, _ in kinds)
         allowed = f"{', '.join(others)} or {last}" if others else last
-        hint = ": a tuple is needed" if isinstance(value, list) else ""
+        hint = ": use a tuple" if isinstance(value, list) else ""
         raise GavoError(f"{where}: must be {allowed}, not {shown(value)}{hint}")
 
 

@@ -60,7 +60,7 @@ def load_settings(path: str | Path, method: str = "ga", preset: str = "default")
     table = read(path, MAX_FILE_BYTES)
     if path.suffix == ".json":
         if not any(part_name in table for part_name in PARTS):
-            raise GavoError(f"{path}: no settings: a run's config.json holds {', '.join(PARTS)}")
+            raise GavoError(f"{path}: contains no settings: a run's config.json has {', '.join(PARTS)}")
         refuse_unknown(str(path), table, CONFIG_KEYS)
         options = table.get("options")
         names = options if isinstance(options, dict) else {}
@@ -87,10 +87,10 @@ def save_settings(path: str | Path, settings: Settings, method: str | None = Non
         GavoError: The file cannot be written, or the settings hold code of another package.
     """
     if not isinstance(settings, Settings):
-        raise GavoError(f"{path}: Settings are needed, not {type(settings).__name__}")
+        raise GavoError(f"{path}: expected Settings, got {type(settings).__name__}")
     known = {type(presets.preset(name).solver): name for name in presets.usable_methods()}
     if type(settings.solver) not in known:
-        raise GavoError(f"{path}: cannot hold a {type(settings.solver).__name__}: not a solver of this package")
+        raise GavoError(f"{path}: cannot store a {type(settings.solver).__name__}: not a solver of this package")
     method = method or known[type(settings.solver)]
     if type(presets.preset(method, preset).solver) is not type(settings.solver):
         raise GavoError(f"{path}: method {method} is not that of a {type(settings.solver).__name__}")
@@ -137,7 +137,7 @@ def _as_toml(place: str, value: Any) -> Any:
     if callable(value):
         name = name_of(value)
         if name is None:
-            raise GavoError(f"{place}: cannot hold a function that is not this package's")
+            raise GavoError(f"{place}: cannot store a function from outside this package")
         return name
     return value
 
@@ -219,7 +219,7 @@ def _refuse_without_effect(before: Settings, after: Settings, values: Mapping[st
             name, other = f"{part_name}.{field.name}", field.metadata.get("instead_of")
             is_idle = other is not None and getattr(part, other) is not None
             if is_idle and name in values and getattr(part, field.name) != getattr(earlier, field.name):
-                raise GavoError(f"{place}: {name} counts only where {part_name}.{other} is none: set that instead")
+                raise GavoError(f"{place}: {name} applies only if {part_name}.{other} is none: set that instead")
 
 
 def takes_whole(settings: Settings, name: str) -> bool:
@@ -261,7 +261,7 @@ def flatten(place: str, table: Mapping[str, Any], is_leaf: Callable[[Any], bool]
 
 def _with_level(where: str, current: Any, level: str, value: Any) -> tuple[Any, ...]:
     if not isinstance(current, tuple) or not level.isdecimal() or int(level) >= len(current):
-        raise GavoError(f"{where}: no such entry of {current!r}")
+        raise GavoError(f"{where}: no such entry in {current!r}")
     entries = list(current)
     entries[int(level)] = _plain(value, is_whole(current))
     return tuple(entries)
@@ -272,7 +272,7 @@ def _convert(where: str, owner: type, field: str, current: Any, value: Any) -> A
     kinds = alternatives(kind_of(owner, field))
     if value == "none":
         if type(None) not in kinds:
-            raise GavoError(f"{where}: cannot be left out")
+            raise GavoError(f"{where}: cannot be none")
         return None
     if callable(current):
         return _callable(where, field, current, value)

@@ -52,13 +52,15 @@ _SENTENCES = {
     AlignmentStatus.UNREADABLE: "The frame could not be read.",
     AlignmentStatus.BLANK: "The image is black, white or saturated.",
     AlignmentStatus.NOISE: "The image is noise.",
-    AlignmentStatus.FROZEN: "The image, or its depth, is the last one once more.",
+    AlignmentStatus.FROZEN: "The image, or its depth, repeats the last one.",
     AlignmentStatus.DEPTH_UNITS: "The depth's range is unlikely: its units may not be the camera's.",
     AlignmentStatus.PARTIAL_DEPTH: "Much of the usual depth is missing.",
     AlignmentStatus.BAD_TIMESTAMP: "The time stamp is not later than the last one, or out of order.",
     AlignmentStatus.GAP: "Frames are missing before this one.",
     AlignmentStatus.NO_REFERENCE: "There is no usable frame before this one.",
-    AlignmentStatus.NOT_RIGID: "The result is no rigid motion: this machine computes wrong numbers (see gavo doctor).",
+    AlignmentStatus.NOT_RIGID: (
+        "The result is not a rigid motion: this machine computes wrong numbers (see gavo doctor)."
+    ),
     AlignmentStatus.IMPLAUSIBLE_MOTION: "A camera can hardly move like that: the image may not belong to its stamp.",
     AlignmentStatus.DEPTH_MISMATCH: "Depth does not agree with the motion that the images show.",
     AlignmentStatus.MOVING_BODY: "The motion may be that of a body that covers much of the image, not the camera's.",

@@ -106,19 +106,19 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         """Convert all to arrays; raise ValueError if they are not numbers or their shapes do not match."""
-        with blamed("Trajectory: numbers are needed"):
+        with blamed("Trajectory: expected numbers"):
             timestamps = np.asarray(self.timestamps, np.float64)
             world_T_camera = np.asarray(self.world_T_camera, np.float64)
             given = None if self.segments is None else np.asarray(self.segments, int)
         if timestamps.ndim != 1 or world_T_camera.shape != (len(timestamps), 4, 4):
-            raise ValueError(f"shapes [n] and [n, 4, 4] expected, got {timestamps.shape} and {world_T_camera.shape}")
+            raise ValueError(f"expected shapes [n] and [n, 4, 4], got {timestamps.shape} and {world_T_camera.shape}")
         object.__setattr__(self, "timestamps", timestamps)
         object.__setattr__(self, "world_T_camera", world_T_camera)
         segments = np.zeros(len(timestamps), int) if given is None else given
         if segments.shape != timestamps.shape:
-            raise ValueError(f"one segment a pose expected, got {segments.shape} for {timestamps.shape}")
+            raise ValueError(f"expected one segment per pose, got {segments.shape} for {timestamps.shape}")
         if np.any(segments < 0):
-            raise ValueError(f"segments are numbered from 0 on, and one is {segments.min()}")
+            raise ValueError(f"segments are numbered from 0, but one is {segments.min()}")
         object.__setattr__(self, "segments", segments)
 
     def require_rigid(self) -> None:
@@ -129,8 +129,8 @@ class Trajectory:
         """
         broken = np.flatnonzero(np.isfinite(self.world_T_camera).all(axis=(1, 2)) & ~is_rigid(self.world_T_camera))
         if len(broken):
-            needed = "a rotation, a column of metres beside it, and 0 0 0 1 below are needed"
-            raise GavoError(f"pose {broken[0]} of {len(self)} is no rigid transform: {needed}")
+            needed = "expected a rotation, a column of metres beside it, and 0 0 0 1 below"
+            raise GavoError(f"pose {broken[0]} of {len(self)} is not a rigid transform: {needed}")
 
     def __len__(self) -> int:
         """Return the number of poses."""
@@ -139,8 +139,8 @@ class Trajectory:
     def __getitem__(self, which: Any) -> "Trajectory":
         """Return some of the poses, by a slice, a mask or a list of indices."""
         if np.ndim(which) == 0 and not isinstance(which, slice):
-            needed = "a slice, a mask or a list of places is needed"
-            raise TypeError(f"Trajectory: {needed}, not {shown(which)}; a single pose is world_T_camera[i]")
+            needed = "expected a slice, a mask or a list of indices"
+            raise TypeError(f"Trajectory: {needed}, got {shown(which)}; a single pose is world_T_camera[i]")
         return Trajectory(self.timestamps[which], self.world_T_camera[which], self.segments[which])
 
     @staticmethod
@@ -163,11 +163,11 @@ class Trajectory:
             raise GavoError(f"{path}: {comment[0][:100]}: expected {COLUMNS}")
         parsed = [_parse_tum_row(place, fields) for place, fields in all_places]
         if not parsed:
-            raise GavoError(f"{path}: holds no trajectory (no rows)")
+            raise GavoError(f"{path}: contains no trajectory (no rows)")
         places = [place for place, row in zip(all_places, parsed, strict=True) if row is not None]
         rows = [row for row in parsed if row is not None]
         if not rows:
-            raise GavoError(f"{all_places[0][0]}: no pose in it, nor in any other row: {NO_POSE}")
+            raise GavoError(f"{all_places[0][0]}: no pose in this row or any other: {NO_POSE}")
         if lost := len(parsed) - len(rows):
             warnings.warn(f"{path}: {lost} of {len(parsed)} rows left out: {NO_POSE}", GavoWarning, stacklevel=2)
         segments = _segments_of(text, [int(place.rpartition(":")[2]) for place, _ in places])
@@ -263,7 +263,7 @@ def require_trajectory(trajectory: Any) -> None:
     """
     if not isinstance(trajectory, Trajectory):
         hint = "gavo.Trajectory.read_tum(path) or gavo.Trajectory(timestamps, world_T_camera)"
-        raise GavoError(f"a Trajectory is needed, not {type(trajectory).__name__}: {hint}")
+        raise GavoError(f"expected a Trajectory, got {type(trajectory).__name__}: {hint}")
 
 
 def _as_stamps(stamps: Any) -> Float[np.ndarray, "*m"]:
@@ -272,7 +272,7 @@ def _as_stamps(stamps: Any) -> Float[np.ndarray, "*m"]:
     except ValueError:  # lists of unequal lengths
         numbers = np.asarray(None)
     if numbers.dtype.kind not in "iuf":
-        raise GavoError(f"interpolate: timestamps: numbers of seconds are needed, not {shown(stamps)}")
+        raise GavoError(f"interpolate: timestamps: expected numbers of seconds, got {shown(stamps)}")
     return numbers.astype(np.float64)
 
 
@@ -423,7 +423,7 @@ def _parse_tum_row(place: str, fields: list[str]) -> list[float] | None:
     if not all(map(math.isfinite, values)):
         return None
     if max(map(abs, values[1:])) > MAX_MAGNITUDE or abs(values[0]) > MAX_STAMP:
-        raise GavoError(f"{place}: holds an absurdly large value")
+        raise GavoError(f"{place}: contains an absurdly large value")
     return values if math.hypot(*values[4:]) >= SHORTEST_QUATERNION else None
 
 

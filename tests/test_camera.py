@@ -274,17 +274,17 @@ def test_no_camera_file_raises_anything_else(tmp_path_factory, content, suffix):
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"fx": -131.0}, "fx: a positive number"),
-        ({"fy": float("nan")}, "fy: a positive number"),
-        ({"cx": "80"}, "cx: a number"),
-        ({"width": 160.0}, "width: a whole number"),
+        ({"fx": -131.0}, "fx: expected a positive number"),
+        ({"fy": float("nan")}, "fy: expected a positive number"),
+        ({"cx": "80"}, "cx: expected a number"),
+        ({"width": 160.0}, "width: expected a whole number"),
         ({"width": 8}, "too small"),
-        ({"depth_scale": 0.0}, "depth_scale: a positive number"),
-        ({"readout": -0.02}, "readout: seconds from 0 on"),
-        ({"distortion": [0.1, 0.0, 0.0, 0.0]}, "distortion: a tuple of 4, 5, 8, 12, 14 numbers"),
-        ({"distortion": (0.1, 0.2, 0.3)}, "distortion: a tuple"),
-        ({"distortion": (0.1,) * 5, "model": "fisheye"}, "distortion: a tuple of 4 numbers"),
-        ({"model": "panorama"}, "model: one of pinhole, fisheye"),
+        ({"depth_scale": 0.0}, "depth_scale: expected a positive number"),
+        ({"readout": -0.02}, "readout: expected seconds of at least 0"),
+        ({"distortion": [0.1, 0.0, 0.0, 0.0]}, "distortion: expected a tuple of 4, 5, 8, 12, 14 numbers"),
+        ({"distortion": (0.1, 0.2, 0.3)}, "distortion: expected a tuple"),
+        ({"distortion": (0.1,) * 5, "model": "fisheye"}, "distortion: expected a tuple of 4 numbers"),
+        ({"model": "panorama"}, "model: expected one of pinhole, fisheye"),
     ],
 )
 def test_a_camera_that_cannot_be_is_refused_before_anything_is_searched(values: dict[str, Any], words: str) -> None:
@@ -299,12 +299,12 @@ def test_a_camera_that_cannot_be_is_refused_before_anything_is_searched(values: 
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"fx": -5}, "fx: a positive number"),
-        ({"fy": np.float32(-5)}, "fy: a positive number"),
-        ({"depth_scale": -1000.0}, "depth_scale: a positive number"),
-        ({"readout": -0.02}, "readout: seconds"),
-        ({"height": 480.5}, "height: a whole number"),
-        ({"width": -640}, "width: a whole number"),
+        ({"fx": -5}, "fx: expected a positive number"),
+        ({"fy": np.float32(-5)}, "fy: expected a positive number"),
+        ({"depth_scale": -1000.0}, "depth_scale: expected a positive number"),
+        ({"readout": -0.02}, "readout: expected seconds"),
+        ({"height": 480.5}, "height: expected a whole number"),
+        ({"width": -640}, "width: expected a whole number"),
     ],
 )
 def test_a_camera_that_cannot_be_is_refused_as_it_is_made(values: dict[str, Any], words: str) -> None:

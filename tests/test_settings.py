@@ -51,7 +51,7 @@ def test_old_names_still_work_and_warn(old, new):
         ("solver", "population", -1, "solver.population: must be at least 4, not -1"),
         ("solver", "population", (0, 16, 16, 16, 2), "solver.population, level 4: must be at least 4, not 2"),
         ("solver", "iterations", 10, "solver.iterations: must be a list of 5 whole numbers, not 10"),
-        ("solver", "iterations", [0, 0, 0, 0, 3], "a tuple is needed"),
+        ("solver", "iterations", [0, 0, 0, 0, 3], "use a tuple"),
         ("solver", "iterations", (0,) * 5, "solver.iterations: every level has 0"),
         ("solver", "iterations", (-1, 0, 0, 6, 8), "solver.iterations: must be at least 0, not -1"),
         ("solver", "patience", 0, "solver.patience: must be at least 1, not 0"),

@@ -74,8 +74,8 @@ def test_values_of_every_kind():
         ("solver.mutation_rate", "high", ["mutation_rate", "number"]),
         ("solver.mutation_rate", True, ["mutation_rate", "number"]),
         ("solver.mutation_rate", float("nan"), ["mutation_rate", "number"]),
-        ("solver.mutation_rate", "none", ["mutation_rate", "cannot be left out"]),
-        ("solver.mutation_rate", 0.9, ["solver.mutation_rate counts only where solver.mutation_step is none"]),
+        ("solver.mutation_rate", "none", ["mutation_rate", "cannot be none"]),
+        ("solver.mutation_rate", 0.9, ["solver.mutation_rate applies only if solver.mutation_step is none"]),
         ("solver.patience", 2.5, ["patience", "whole"]),
         ("solver.patience", -1, ["patience", "at least 1"]),
         ("solver.population", [16, 16], ["population", "list of 5 whole numbers"]),
@@ -143,7 +143,7 @@ def test_every_preset_comes_back_from_its_file(method, name, tmp_path):
 
 @pytest.mark.parametrize("other", [None, "fast", presets.preset("ga").solver])
 def test_what_are_no_settings_is_not_written(tmp_path, other):
-    with pytest.raises(GavoError, match=rf"s\.toml: Settings are needed, not {type(other).__name__}"):
+    with pytest.raises(GavoError, match=rf"s\.toml: expected Settings, got {type(other).__name__}"):
         save_settings(tmp_path / "s.toml", other)
     assert not list(tmp_path.iterdir())
 
@@ -151,7 +151,7 @@ def test_what_are_no_settings_is_not_written(tmp_path, other):
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ({}, "no settings: a run's config.json holds solver, alignment, odometry"),
+        ({}, "no settings: a run's config.json has solver, alignment, odometry"),
         ({"method": "gauss-newton", "preset": "fast", "segments": 1}, "no settings"),
         ({"alignment": {}, "odometri": {}}, "unknown key 'odometri'; did you mean 'odometry'?"),
     ],

@@ -128,8 +128,8 @@ def test_rows_are_sorted_comments_skipped_and_quaternions_normalised(tmp_path):
         (GOOD + "1 2 3 4 5 6 7 8 9\n", ":2: expected 8"),
         (GOOD + "a b c d e f g h\n", ":2: "),
         ("nan nan nan nan nan nan nan nan\n", ":1: "),
-        ("2.0 1 2 inf 0 0 0 1\n2.1 1 2 3 0 0 0 nan\n", ":1: no pose in it, nor in any other row"),
-        ("2.0 1 2 3 0 0 0 0\n2.1 1 2 3 1e-200 0 0 0\n", ":1: no pose in it, nor in any other row"),
+        ("2.0 1 2 inf 0 0 0 1\n2.1 1 2 3 0 0 0 nan\n", ":1: no pose in this row or any other"),
+        ("2.0 1 2 3 0 0 0 0\n2.1 1 2 3 1e-200 0 0 0\n", ":1: no pose in this row or any other"),
         (GOOD + "2.0 1e300 2 3 0 0 0 1\n", "absurd"),
     ],
 )
@@ -243,11 +243,11 @@ def test_interpolation_at_one_stamp_is_one_pose():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("1.0",), "timestamps: numbers of seconds are needed, not '1.0'"),
-        ((None,), "timestamps: numbers of seconds are needed, not None"),
-        (([[1.0], [1.0, 2.0]],), "timestamps: numbers of seconds are needed"),
-        (([0.0], "1"), "max_gap: a number is needed, not '1'"),
-        (([0.0], None), "max_gap: a number is needed, not None"),
+        (("1.0",), "timestamps: expected numbers of seconds, got '1.0'"),
+        ((None,), "timestamps: expected numbers of seconds, got None"),
+        (([[1.0], [1.0, 2.0]],), "timestamps: expected numbers of seconds"),
+        (([0.0], "1"), "max_gap: expected a number, got '1'"),
+        (([0.0], None), "max_gap: expected a number, got None"),
     ],
 )
 def test_interpolation_at_what_is_no_stamp_is_refused(arguments: tuple, words: str):
@@ -260,7 +260,7 @@ def test_interpolation_at_what_is_no_stamp_is_refused(arguments: tuple, words: s
     [(["a"], [np.eye(4)]), ([0.0], [["a"]]), ([0.0, 1.0], [[1.0], [1.0, 2.0]]), ([0.0], [np.eye(4)], ["first"])],
 )
 def test_what_is_no_number_makes_no_trajectory(arguments: tuple):
-    with pytest.raises(GavoError, match="^Trajectory: numbers are needed: "):
+    with pytest.raises(GavoError, match="^Trajectory: expected numbers: "):
         Trajectory(*arguments)
 
 
@@ -268,7 +268,7 @@ def test_one_place_of_a_trajectory_is_no_trajectory():
     trajectory = random_trajectory(4, 2)
     assert len(trajectory[[1]]) == len(trajectory[1:2]) == 1
     for which in (1, np.int64(1), "1", None):
-        with pytest.raises(TypeError, match=r"a slice, a mask or a list of places is needed, .*world_T_camera\[i\]"):
+        with pytest.raises(TypeError, match=r"expected a slice, a mask or a list of indices, .*world_T_camera\[i\]"):
             trajectory[which]
     with pytest.raises(TypeError, match="a slice, a mask"):
         list(trajectory)  # pyright: ignore[reportArgumentType]
@@ -359,5 +359,5 @@ def test_columns_in_another_order_are_refused(tmp_path, heading):
 
 def test_segments_below_zero_are_refused():
     """They were lost in a file."""
-    with pytest.raises(ValueError, match="from 0 on"):
+    with pytest.raises(ValueError, match="numbered from 0, but"):
         Trajectory(np.arange(2.0), np.stack([np.eye(4)] * 2), np.array([0, -1]))

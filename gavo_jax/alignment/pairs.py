@@ -98,7 +98,7 @@ def starts_of(
     if guesses is None:
         guesses = np.broadcast_to(np.eye(4, dtype=np.float32), shape)
     elif np.shape(guesses) != shape:
-        raise GavoError(f"guesses are of shape {np.shape(guesses)}: target_T_reference is needed, {shape}")
+        raise GavoError(f"guesses have shape {np.shape(guesses)}: expected target_T_reference, {shape}")
     else:
         guesses = _rigid_guesses(np.asarray(guesses, np.float64))
     kinds = FEATURE_KINDS[settings.alignment.features] if settings.alignment.refine else ()
@@ -116,7 +116,7 @@ def _as_numbers(guesses: Any) -> Float64[np.ndarray, "*b 4 4"]:
     try:
         return np.asarray(guesses, np.float64)
     except (TypeError, ValueError):
-        raise GavoError(f"target_T_reference is needed as a guess, a matrix of numbers, not {shown(guesses)}") from None
+        raise GavoError(f"guess: expected target_T_reference, a matrix of numbers, got {shown(guesses)}") from None
 
 
 def _rigid_guesses(guesses: Float64[np.ndarray, "b 4 4"]) -> Float64[np.ndarray, "b 4 4"]:
@@ -128,7 +128,7 @@ def _rigid_guesses(guesses: Float64[np.ndarray, "b 4 4"]) -> Float64[np.ndarray,
     broken = np.flatnonzero(~is_rigid(guesses))
     if len(broken):
         which = f"guess {broken[0]}" if len(guesses) > 1 else "the guess"
-        raise GavoError(f"{which} is no rigid motion: target_T_reference, a rotation and a translation, is needed")
+        raise GavoError(f"{which} is not a rigid motion: expected target_T_reference, a rotation and a translation")
     return rigid(guesses)
 
 

@@ -95,10 +95,10 @@ class Alignment(NamedTuple):
         """The status of the result in a sentence or two."""
         words, left_open = self.status.sentence, self.undetermined
         if self.status is AlignmentStatus.FROZEN:
-            words = f"The {self.frozen} is the last one once more."
+            words = f"The {self.frozen} repeats the last one."
         if left_open and self.status is AlignmentStatus.LOW_TEXTURE:
             return f"{words[:-1]}, above all {left_open}."
-        return f"{words} The images leave open: {left_open}." if left_open else words
+        return f"{words} The images do not determine: {left_open}." if left_open else words
 
 
 def on_host(alignment: Alignment) -> Alignment:

@@ -60,10 +60,10 @@ def typed_keys(keys: Any, shape: tuple[int, ...]) -> PRNGKeyArray:
         with suppress(TypeError, ValueError):  # numbers of another shape are not keys
             keys = jax.random.wrap_key_data(keys)
     if not isinstance(keys, jax.Array) or not jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):
-        raise GavoError(f"a key is needed, jax.random.key(seed), not {shown(keys)}")
+        raise GavoError(f"expected a key, jax.random.key(seed), got {shown(keys)}")
     if keys.shape != shape:
-        example = f"one per pair is needed, jax.random.split(key, {shape[0]})" if shape else "a single one is needed"
-        raise GavoError(f"keys are of shape {keys.shape}: {example}")
+        example = f"expected one per pair, jax.random.split(key, {shape[0]})" if shape else "expected a single key"
+        raise GavoError(f"keys have shape {keys.shape}: {example}")
     return keys
 
 
@@ -74,7 +74,7 @@ def _plain(image: Any) -> Any:
 
 def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
     if not isinstance(frame, Frame) and (not isinstance(frame, tuple | list) or len(frame) != 2):
-        raise GavoError(f"a Frame is needed, or a pair (grey, depth), not {type(frame).__name__}")
+        raise GavoError(f"expected a Frame or a pair (grey, depth), got {type(frame).__name__}")
     grey, depth = map(_plain, (frame.grey, frame.depth) if isinstance(frame, Frame) else frame)
     for name, image in (("grey", grey), ("depth", depth)):
         require_image(name, image, (camera.height, camera.width))
@@ -106,10 +106,10 @@ def stacked_images(side: Any, camera: Camera) -> Images:
     """
     require_camera(camera)
     if not hasattr(side, "__len__"):
-        raise GavoError(f"lists of frames are needed, or pairs of arrays, not {type(side).__name__}")
+        raise GavoError(f"expected lists of frames or pairs of arrays, got {type(side).__name__}")
     is_stacked = isinstance(side, tuple) and len(side) == 2 and not isinstance(side[0], tuple) and np.ndim(side[0]) == 3
     if not len(side[0] if is_stacked else side):
-        raise GavoError("a batch of no frames: at least one pair is needed")
+        raise GavoError("a batch of no frames: expected at least one pair")
     if is_stacked:
         side = tuple(map(_plain, side))
         if camera.is_distorted:

@@ -170,7 +170,7 @@ def estimate_camera(
     sequence = without_distortion(sequence)
     wanted, camera = tuple(wanted), sequence.camera
     if unknown := set(wanted) - {"depth_scale", *_STAGES}:
-        raise GavoError(f"wanted: not one of depth_scale, {', '.join(_STAGES)}: {', '.join(sorted(unknown))}")
+        raise GavoError(f"wanted: unknown {', '.join(sorted(unknown))}: not one of depth_scale, {', '.join(_STAGES)}")
     found: dict[str, Found] = {}
     if "depth_scale" in wanted:
         found["depth_scale"] = _depth_scale(sequence)
@@ -189,7 +189,7 @@ def estimate_camera(
         trial.settle()
     pairs = int(sum(np.asarray(m.usable)[EDGE:-EDGE].sum() for m in trial.match(trial.unknowns)))
     if pairs < LEAST_FRAMES // 2:
-        raise GavoError(f"{sequence.name}: only {pairs} pairs of frames can be aligned: nothing can be found from them")
+        raise GavoError(f"{sequence.name}: only {pairs} pairs of frames can be aligned, too few to estimate anything")
     interval = min(float(np.median(np.diff(times))) for times in stamps)
     minima: dict[str, Minimum] = {}
     for number in range(rounds):
@@ -289,14 +289,14 @@ def _judged(minima: dict[str, Minimum], trial: _Trial, interval: float, guessed:
     for name, least in minima.items():
         kind, unit, how = _KINDS[name]
         if name == "readout" and least.value >= interval:
-            how += "; at the longest that it can be, the time between two frames"
+            how += "; this is the longest possible, the time between two frames"
         if unit == "s" and guessed:
-            how += f"; as true as the stamps, which are a guess ({guessed})"
+            how += f"; only as accurate as the stamps, which are a guess ({guessed})"
         scale = getattr(trial.camera, name) if kind == "focal_length" else 1.0
         if least.deviation < TOO_UNSURE[kind] * scale:
             found[name] = Found(least.value, float(np.hypot(least.deviation, SHARED[kind] * scale)), unit, how)
         else:
-            found[name] = Found(None, None, unit, "the motion in these frames leaves it open")
+            found[name] = Found(None, None, unit, "the motion in these frames does not determine it")
     return found
 
 
@@ -306,14 +306,14 @@ def _depth_scale(sequence: Sequence) -> Found:
     camera, unit = sequence.camera, "units per metre"
     looks_so = KINECT_VIEW[0] < camera.fx / max(camera.width, camera.height) < KINECT_VIEW[1]
     if sample is None or sample.kinect_scale is None or not looks_so:
-        why = "images alone do not tell: a world of another size looks alike, and depth has no steps of a known sensor"
+        why = "images alone cannot tell: a larger world looks the same, and depth lacks the steps of a known sensor"
         return Found(None, None, unit, why)
     scale = sample.kinect_scale
     common = min(COMMON, key=lambda other: abs(np.log(scale / other)))
     if abs(scale / common - 1) < SNAP:
-        why = f"the common unit nearest to {scale:.0f}, which the steps of depth say, as of a first Kinect"
+        why = f"the common unit nearest to {scale:.0f}, which the steps of depth indicate, like those of a first Kinect"
         return Found(common, None, unit, why)
-    return Found(scale, STEPS_DEVIATION * scale, unit, "steps of depth, as of a first Kinect")
+    return Found(scale, STEPS_DEVIATION * scale, unit, "steps of depth, like those of a first Kinect")
 
 
 def _with_found(sequence: Sequence, found: dict[str, Found]) -> Camera:
@@ -333,7 +333,7 @@ def _stretches(sequence: Sequence) -> list[list[Frame]]:
     Raises:
         GavoError: none has enough frames.
     """
-    too_few = GavoError(f"{sequence.name}: at least {LEAST_FRAMES} frames in a row that can be read are needed")
+    too_few = GavoError(f"{sequence.name}: needs at least {LEAST_FRAMES} readable frames in a row")
     if len(sequence) < LEAST_FRAMES:
         raise too_few
     count = min(len(sequence), MOST_SEARCHED)

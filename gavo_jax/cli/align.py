@@ -123,5 +123,5 @@ def _cameras(options: Align) -> tuple[Calibration, float | None]:
     else:
         found = load_calibration(options.camera, size)
     if fault is not None and not found.states_depth_scale and options.depth_scale is None:
-        raise GavoError(f"{fault}; to do without the other frames, say --depth-scale")
+        raise GavoError(f"{fault}; to ignore the other frames, pass --depth-scale")
     return found, options.depth_scale

@@ -22,13 +22,13 @@ def calibrate(options: Calibrate) -> int:
     """Estimate the camera, print a table (or JSON), and write the camera file."""
     output = options.output or Path("camera.toml")
     if output.suffix.lower() != ".toml":
-        raise GavoError(f"{output}: a camera file ends in .toml")
+        raise GavoError(f"{output}: the name of a camera file must end in .toml")
     if not output.absolute().parent.is_dir():
         raise GavoError(f"{output}: no such folder: {output.parent}")
     if output.is_dir():
-        raise GavoError(f"{output}: a folder: name a file for the camera")
+        raise GavoError(f"{output}: is a folder: choose a file for the camera")
     if options.output is None and os.path.lexists(output):
-        raise GavoError(f"{output}: is there already: name another file with --output, or this one to replace it")
+        raise GavoError(f"{output}: already exists: choose another file with --output, or pass this one to replace it")
     wanted: list[Wanted] = [*ALWAYS]
     if options.focal_length:
         wanted.append("focal_length")
@@ -45,7 +45,7 @@ def calibrate(options: Calibrate) -> int:
         print(json_text(_facts(estimate)))
         return 0
     rows = [(name, *_cells(found)) for name, found in estimate.found.items()]
-    print_table(f"camera of {sequence.name}, by {estimate.pairs} pairs of frames", ("", "", "±", "unit"), rows)
+    print_table(f"camera of {sequence.name}, from {estimate.pairs} pairs of frames", ("", "", "±", "unit"), rows)
     for name, found in estimate.found.items():
         say(f"{name}: {found.why}")
     say(f"camera file: {output}")
@@ -72,7 +72,7 @@ def with_total_delay(found: dict[str, Found], depth_delay: float) -> dict[str, F
     beyond = found.get("depth_delay")
     if beyond is None or beyond.value is None or beyond.value == depth_delay:
         return found
-    why = f"{beyond.why}; {beyond.value:+.4f} s of it was found now"
+    why = f"{beyond.why}; {beyond.value:+.4f} s of it is new"
     return found | {"depth_delay": beyond._replace(value=depth_delay, why=why)}
 
 

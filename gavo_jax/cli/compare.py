@@ -122,7 +122,7 @@ def compare(options: Compare) -> int:
         remove_figures(folder)
         say(summary(sequence))
         if line := left_out_in_short(sequence):
-            say(f"{line}; gavo inspect says why")
+            say(f"{line}; gavo inspect shows why")
         entries, status = _run_contenders(options, contenders, sequence, peers, folder)
         planned = sum(1 if contender.preset is None else options.seeds for contender in contenders)
         cut_short = f"interrupted: {len(entries)} of {planned} runs were done" if status == INTERRUPTED else ""

@@ -57,7 +57,7 @@ def doctor(command: Doctor) -> int:
     if plugins:
         faults.append("packages that bring methods or datasets")
     faults += interruptible(_print_checks)
-    say("all is well" if not faults else f"not as it should be: {', '.join(faults)}")
+    say("all is well" if not faults else f"problems found: {', '.join(faults)}")
     return CHECK_FAILED if faults else 0
 
 
@@ -95,7 +95,7 @@ def _cache() -> tuple[str, bool]:
     """Describe the cache folder, and return whether compiled programs can be kept there."""
     folder = cache_folder()
     if folder is None:
-        return "none: there is no home folder, and GAVO_CACHE_DIR is not set", False
+        return "none: no home folder, and GAVO_CACHE_DIR is not set", False
     try:
         if fault := why_not_private(folder):
             return f"{_without_home(folder)}, NOT private, so NOT in use: {fault}", False

@@ -74,9 +74,9 @@ def _remarks(paths: tuple[Path, Path], read: list[tuple[Trajectory, float]]) -> 
     """Yield a remark for each file that was not read literally."""
     for path, (one, unit), (other, _) in zip(paths, read, reversed(read), strict=True):
         if unit in UNITS:
-            yield f"{path}: its stamps are taken for {UNITS[unit]}"
+            yield f"{path}: its stamps are taken as {UNITS[unit]}"
         if is_w_first(one, other):
-            yield f"{path}: its rotations agree once its quaternions are taken as w x y z: write them as x y z w"
+            yield f"{path}: its rotations agree only if its quaternions are read as w x y z; write them as x y z w"
 
 
 NAMES = ("rpe_translation", "rpe_rotation", "ate", "distance_error")
@@ -127,7 +127,7 @@ def _check_units(estimate: np.ndarray, truth: np.ndarray) -> None:
             is_alike = abs(unit * np.ptp(stamps) / np.ptp(others) - 1) < DURATION_TOLERANCE or not _meet(stamps, others)
             if is_alike and _meet(unit * stamps, others) and unit * np.median(np.diff(stamps)) > INTERVALS[0]:
                 raise GavoError(
-                    f"the stamps of the {whose} look like {name}, the other ones like seconds: write both so"
+                    f"the stamps of the {whose} look like {name}, the others like seconds; write both in seconds"
                 )
 
 
@@ -142,11 +142,11 @@ def _hint(estimate: Trajectory, truth: Trajectory, options: Evaluate) -> str:
         return ""
     (first, last), (start, end) = ((some.min(), some.max()) for some in stamps)
     if first > end or last < start:
-        return f": the estimate goes from {first:.3f} to {last:.3f} s, the truth from {start:.3f} to {end:.3f} s"
+        return f"; the estimate covers {first:.3f} to {last:.3f} s, the truth {start:.3f} to {end:.3f} s"
     if options.unit == "s" and last - first <= options.delta:
-        return f": the estimate lasts {last - first:.2f} s: set --delta, or --unit frames"
+        return f"; the estimate lasts {last - first:.2f} s: set --delta, or --unit frames"
     if options.unit == "s" and np.median(np.diff(np.sort(stamps[0]))) > options.delta:
-        return ": set --delta, or --unit frames"
+        return "; set --delta, or --unit frames"
     return ""
 
 

@@ -23,12 +23,12 @@ def experiment(options: Experiment) -> int:
     """Print the plan, run what the table lacks, print and write the report; return the exit status."""
     if options.file == REPORT:
         if options.folder is None:
-            raise GavoError("report: which folder? gavo experiment report DIR")
+            raise GavoError("report: no folder given; use gavo experiment report DIR")
         if options.dry_run or options.output is not None or options.executor != "local":
-            raise GavoError("report: nothing is run: --dry-run, --output and --executor say nothing")
+            raise GavoError("report: runs nothing, so --dry-run, --output and --executor do not apply")
         return report(options.folder, options.markdown)
     if options.folder is not None:
-        raise GavoError(f"unexpected argument {str(options.folder)!r}: the folder for results is --output DIR")
+        raise GavoError(f"unexpected argument {str(options.folder)!r}: pass the folder for results as --output DIR")
     plan = read_plan(options.file, options.output)
     table = Table(plan.folder)
     if options.dry_run:
@@ -58,7 +58,7 @@ def _run_missing(plan: Plan, table: Table, executor_name: str) -> None:
             except KeyboardInterrupt:
                 raise KeyboardInterrupt(
                     f": {len(plan.runs) - len(missing(plan, table))} of {len(plan.runs)} runs are in {table.folder}; "
-                    "the same command goes on from there"
+                    "the same command resumes from there"
                 ) from None
     if finished.faults:
         raise GavoError(

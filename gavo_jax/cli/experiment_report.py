@@ -43,9 +43,9 @@ MEANINGS = {
     "from": "from, to: quartiles of the m/s.",
     "printed": "printed: the m/s that a publication prints.",
     "m/frame": "m/frame: relative pose error from frame to frame, RMSE, median over the runs.",
-    "lost": "lost: frame pairs without a usable motion, of the worst run.",
+    "lost": "lost: frame pairs without a usable motion, in the worst run.",
     "ms/frame": "ms/frame: time, decoding included, median over the runs.",
-    "together": "together: most runs that shared the machine and its time.",
+    "together": "together: largest number of runs that shared the machine and its time.",
 }
 """Explanations of the table's columns."""
 TEST = (
@@ -57,7 +57,7 @@ TEST = (
 def report(folder: Path, markdown: bool = False) -> int:
     """Print the tables of an experiment's folder, optionally as Markdown; write report.html and the figure there."""
     if not folder.is_dir():
-        raise GavoError(f"{folder}: no results of an experiment: no such folder")
+        raise GavoError(f"{folder}: no experiment results: no such folder")
     with hold(prepare_folder(folder)):
         return report_held(folder, markdown)
 
@@ -131,9 +131,9 @@ def _notes(
     """Return notes on the tables; `others` are rows of runs that are not in the experiment's current plan."""
     notes = _without_drift(summaries)
     if (states := len({_state(row) for row in rows})) > 1:
-        notes.append(f"The rows come from {states} versions of the software or of what it uses.")
+        notes.append(f"The rows come from {states} versions of the software or its dependencies.")
     if others:
-        notes.append(f"{len(others)} of {len(rows)} runs are of earlier versions of the experiment's file.")
+        notes.append(f"{len(others)} of {len(rows)} runs are from earlier versions of the experiment's file.")
     return notes
 
 
@@ -144,7 +144,7 @@ def _without_drift(summaries: Sequence[Summary]) -> list[str]:
     none = [name for name in dict.fromkeys(summary.sequence for summary in summaries) if name not in told]
     short, blind = ([name for name in none if (name in by_frame) is known] for known in (True, False))
     lost = [summary for summary in summaries if summary.drift is None and summary.sequence in told]
-    notes = [f"No drift of {one.sequence} by {one.label}: no part that it followed lasts 1 s." for one in lost]
+    notes = [f"No drift of {one.sequence} by {one.label}: no tracked part lasts 1 s." for one in lost]
     notes += [f"No drift of {', '.join(short)}: no two frames that the truth covers are 1 s apart."] if short else []
     return notes + ([f"No errors of {', '.join(blind)}: no ground truth covers it."] if blind else [])
 

@@ -9,12 +9,12 @@ from gavo_jax.output.files import json_text
 from gavo_jax.output.screen import counted, frame_progress, say
 
 NOTES = {
-    "gap": "frames are missing before; used in full",
-    "frozen": "depth repeats that of the frame before; the image alone is used",
-    "no_depth": "too few depth readings; aligned with a frame before, and no later one with it",
-    "partial_depth": "much of the usual depth is missing; aligned with a frame before, and no later one with it",
+    "gap": "frames are missing before it; used in full",
+    "frozen": "depth repeats that of the previous frame; only the image is used",
+    "no_depth": "too few depth readings; aligned to an earlier frame; no later frame is aligned to it",
+    "partial_depth": "much of the usual depth is missing; aligned to an earlier frame; no later frame is aligned to it",
     "depth_units": "depth may be in other units; used in full",
-    "moving_body": "a part of the image repeats the one before; used in full",
+    "moving_body": "part of the image repeats the previous one; used in full",
 }
 """How a run treats doubtful frames, by status."""
 
@@ -44,19 +44,17 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     lines += [("time", _time(facts)), ("camera", _camera(facts["camera"]) + f", from {facts['camera_from']}")]
     lines += _recorded(facts["recorded_camera"], facts["camera"])
     if not facts["camera"]["readout"]:
-        lines.append(("shutter", "all rows are taken as exposed at once; gavo calibrate finds whether they are"))
+        lines.append(("shutter", "all rows are assumed to be exposed at once; gavo calibrate checks whether they are"))
     lines += [("depth", _depth(facts))]
     if fault := facts["depth"]["fault"]:
         lines.append(("depth scale", f"WRONG? {fault}"))
     if doubt := facts["depth"]["doubt"]:
         lines.append(("depth in doubt", doubt))
     if fault := facts["depth"]["lies"]:
-        lines.append(("depth image", f"WRONG? {fault} beside the colour image, by the edges of both"))
+        lines.append(("depth image", f"WRONG? {fault} relative to the colour image, judging by the edges of both"))
     if (delay := facts["delay_of_depth_ms"]) is not None:
         side = "before" if delay["median"] < 0 else "after"
-        words = (
-            f"{abs(delay['median']):.1f} ms {side} colour in the median, {delay['least']:.1f} to {delay['most']:.1f}"
-        )
+        words = f"median {abs(delay['median']):.1f} ms {side} colour, from {delay['least']:.1f} to {delay['most']:.1f}"
         lines.append(("delay of depth", words))
     return [*lines, ("ground truth", _truth(facts))]
 

@@ -36,7 +36,7 @@ from gavo_jax.trajectory import Trajectory
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
 
-NOT_LIVE = "not with the live source '{}': record it and run over that"
+NOT_LIVE = "not available for the live source '{}': record it, and run over the recording"
 
 
 def run_live(options: Run) -> int:
@@ -68,7 +68,7 @@ def _follow(options: Run, device: LiveDevice, settings: Settings, shape: Shape) 
         if odometry.progress.last_index < 1:
             tracked = odometry.progress.last_index + 1
             seen = f"{tracked} of {newest.received} frames" if newest.received > tracked else f"{tracked} frames"
-            raise end.fault or GavoError(f"{device.name}: ended after {seen}: at least two are needed")
+            raise end.fault or GavoError(f"{device.name}: ended after {seen}: needs at least two")
         steps = folder.steps()  # this drops a step that an interruption left incomplete
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         first = float(trajectory.timestamps[0])
@@ -84,8 +84,8 @@ def _follow(options: Run, device: LiveDevice, settings: Settings, shape: Shape) 
         if options.map is not None and scene is not None:
             write_map(scene.finish(shape), options.map)
         write_trajectories(trajectory, folder.path, formats(options.trajectory_format))
-    dropped = f"{newest.dropped} of {newest.received} frames came while another was tracked"
-    say(f"{dropped}, or programs were compiled, and made room for newer ones")
+    dropped = f"{newest.dropped} of {newest.received} frames were dropped for newer ones"
+    say(f"{dropped}: they came while another was tracked, or programs were compiled")
     if end.fault is not None:
         raise end.fault
     if end.interrupted:

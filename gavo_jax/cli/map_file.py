@@ -25,15 +25,15 @@ def check_map_options(path: Path | None, shape: Shape | None, voxel: float) -> S
     if path is None:
         for option, is_given in (("--map-shape", shape is not None), ("--voxel", voxel != Run.voxel)):
             if is_given:
-                raise GavoError(f"{option}: is of a map, and there is none: add --map FILE")
+                raise GavoError(f"{option}: applies only with --map FILE")
         return shape or "cloud"
     shape = check_map(path, shape)
     if not path.absolute().parent.is_dir():
         raise GavoError(f"{path}: no such folder: {path.parent}")
     if not os.access(path.absolute().parent, os.W_OK):
-        raise GavoError(f"{path}: cannot be written: the folder is closed to you")
+        raise GavoError(f"{path}: cannot be written: no permission to write to the folder")
     if path.is_dir():
-        raise GavoError(f"{path}: a folder: name a file for the map")
+        raise GavoError(f"{path}: is a folder: choose a file for the map")
     import_open3d("map")
     return shape
 

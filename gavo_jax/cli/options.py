@@ -41,7 +41,7 @@ class Source:
     """Take every S-th frame."""
     depth_scale: Annotated[float | None, arg(metavar="U", help_behavior_hint="(default: the camera's)")] = None
     """Raw depth units per metre: 5000 for TUM, 1000 for millimetres."""
-    rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="(default: by the stamps, else 30)")] = None
+    rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="(default: from the stamps, else 30)")] = None
     """Frames per second, if frames have numbers but no timestamps."""
     colour_topic: Annotated[str | None, arg(metavar="TOPIC", help_behavior_hint="(default: found by type)")] = None
     """Topic of a recording's colour images."""
@@ -50,7 +50,7 @@ class Source:
     moving: Annotated[int, arg(metavar="N")] = 0
     """Number of bodies that move through the synthetic room: a box, a walking figure, more boxes."""
     force: bool = False
-    """Go on even if the scale of the depth looks wrong."""
+    """Continue even if the depth scale looks wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,15 +60,15 @@ class SearchOptions:
     method: Annotated[
         Method,
         arg(
-            help="Genetic algorithm, particle swarm, Gauss-Newton (the classic method), Adam. Further names are those "
-            "of installed packages."
+            help="Genetic algorithm, particle swarm, Gauss-Newton (the classic method), Adam. Installed "
+            "packages may add others."
         ),
     ] = "ga"
     preset: Annotated[
         PresetName,
         arg(
             help="Settings: the project's own, the paper's, for speed, for large motions. Each of the four methods has "
-            "all of them; a method of another package has default alone."
+            "all of them; a method of another package has only default."
         ),
     ] = "default"
     settings: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the preset's)")] = None
@@ -88,7 +88,7 @@ class Run(SearchOptions, Source):
         Literal["previous", "keyframe"] | None,
         arg(metavar="{previous,keyframe}", help_behavior_hint="(default: the preset's)"),
     ] = None
-    """What a frame is aligned to: the previous frame alone, or it and a keyframe at once."""
+    """What a frame is aligned to: only the previous frame, or that and a keyframe at once."""
     on_lost: Annotated[
         Literal["hold", "predict", "stop"] | None,
         arg(metavar="{hold,predict,stop}", help_behavior_hint="(default: the preset's)"),
@@ -102,7 +102,7 @@ class Run(SearchOptions, Source):
     output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/SEQUENCE-METHOD-PRESET)")] = (
         None
     )
-    """Folder for trajectory.txt, metrics.json, frames.csv, config.json and figures; an earlier run's are replaced."""
+    """Folder for trajectory.txt, metrics.json, frames.csv, config.json and figures; earlier ones are replaced."""
     trajectory_format: Annotated[str, arg(metavar="{tum,kitti,euroc,json,bag}")] = "tum"
     """Further formats of the trajectory, comma-separated: KITTI, EuRoC's CSV, JSON, a ROS 2 bag of poses."""
     map: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(.ply, .pcd or .obj; default: none)")] = None
@@ -131,8 +131,8 @@ class Compare(Source):
         str,
         arg(
             metavar="NAME,NAME,…",
-            help="Methods of `gavo run` and odometries of other libraries, with commas between: "
-            f"{', '.join((*METHODS, *PEERS))}. A method may have a preset of its own: ga:fast.",
+            help="Methods of `gavo run` and odometries of other libraries, separated by commas: "
+            f"{', '.join((*METHODS, *PEERS))}. A method may have its own preset: ga:fast.",
         ),
     ] = "ga,pso,gauss-newton,adam,opencv-rgb,opencv-rgbd"
     preset: PresetName = "default"
@@ -156,7 +156,7 @@ class View:
     search: Annotated[
         bool,
         arg(
-            help="Do not track the frames once more: paths and images are there at once, without the particles.",
+            help="Do not track the frames again: paths and images appear at once, without the particles.",
             help_behavior_hint="(default: they are tracked)",
         ),
     ] = True

@@ -82,7 +82,7 @@ def run(options: Run) -> int:
         metrics, interrupted = folder.finished() if options.resume else None, False
         if metrics is not None:
             shown = "" if options.viewer == "none" else f"; gavo view {folder.path} shows it"
-            print_message(f"{folder.path}: the run came to its end before: nothing to resume{shown}")
+            print_message(f"{folder.path}: the run is already complete: nothing to resume{shown}")
         else:
             # before an earlier run is replaced, as opening may fail
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
@@ -103,7 +103,7 @@ def run(options: Run) -> int:
             save_map(options.map, sequence, folder, trajectory, shape, options.voxel)
         write_trajectories(trajectory, folder.path, trajectory_formats)
     if truth is not None and is_w_first(truth, trajectory):
-        say("The ground truth agrees once its quaternions are taken as w x y z: write them as x y z w.")
+        say("The ground truth agrees only if its quaternions are read as w x y z; write them as x y z w.")
     if interrupted:
         return INTERRUPTED
     viewer.stay()
@@ -113,7 +113,7 @@ def run(options: Run) -> int:
 def _start(options: Run, sequence: Sequence, folder: RunFolder, config: dict[str, Any]) -> None:
     """Start the files of a run, replacing an earlier run's."""
     if options.resume:
-        say(f"nothing to resume in {folder.path}: a new run")
+        say(f"nothing to resume in {folder.path}: starting a new run")
     if folder.has_run():
         say(f"the earlier run in {folder.path} is replaced")
     folder.start(config, float(sequence.timestamps[0]))
@@ -182,7 +182,7 @@ def _track(
     tracked = track_visibly(name, sequence, odometry, on_step, viewer, mapper)
     if tracked.interrupted:
         folder.save_checkpoint()
-        say("The same command with --resume goes on from there.")
+        say("Run the same command with --resume to continue from there.")
     outcome = interruptible(
         lambda: finish_run(
             float(sequence.timestamps[0]),

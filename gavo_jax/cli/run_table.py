@@ -93,7 +93,7 @@ def print_run(
     rows += _of_bodies(folder / BODIES)
     print_table(name, ("", "", "unit"), rows)
     if reason := why_no_drift(metrics, trajectory, truth is not None):
-        say(reason if known else f"{reason} The table has what the trajectory itself tells.")
+        say(reason if known else f"{reason} The table shows what the trajectory alone tells.")
     if known and (part := covered_in_part(trajectory, truth)):
         say(part)
     say(f"files in {folder}")
@@ -148,7 +148,7 @@ def why_no_drift(metrics: Mapping[str, Any], trajectory: Trajectory, has_truth: 
     if not has_truth:
         return "No ground truth, so no errors."
     if metrics.get(DRIFT_PER_FRAME) is None:
-        return "The ground truth covers no two of these frames, so no errors."
+        return "The ground truth covers fewer than two of these frames, so no errors."
     lasts = float(np.ptp(trajectory.timestamps))
     if lasts < 1:
         return f"No drift over 1 s: the frames last {lasts:.2f} s; see the errors per frame and of the whole run."
@@ -156,8 +156,8 @@ def why_no_drift(metrics: Mapping[str, Any], trajectory: Trajectory, has_truth: 
     if apart > 1:
         return f"No drift over 1 s: the frames are {apart:.2f} s apart; see the errors per frame and of the whole run."
     if metrics.get("segments", 1) > 1:
-        return "No drift over 1 s: the trajectory is in segments, of which none lasts 1 s: see the other errors."
-    return "No drift over 1 s: no two frames that the ground truth covers are 1 s apart: see the other errors."
+        return "No drift over 1 s: no segment of the trajectory lasts 1 s; see the other errors."
+    return "No drift over 1 s: no two frames that the ground truth covers are 1 s apart; see the other errors."
 
 
 def covered_in_part(trajectory: Trajectory, truth: Trajectory | None) -> str | None:
@@ -167,4 +167,6 @@ def covered_in_part(trajectory: Trajectory, truth: Trajectory | None) -> str | N
     covered = int(np.count_nonzero(truth.interpolate(trajectory.timestamps)[1]))
     if covered in (0, len(trajectory)):
         return None
-    return f"The ground truth covers {covered} of {len(trajectory)} poses: errors are of these, up to the last of them."
+    return (
+        f"The ground truth covers {covered} of {len(trajectory)} poses: errors are for these, up to the last of them."
+    )

@@ -31,13 +31,13 @@ def open_sequence(source: Source, force: bool = False, color: bool = False) -> S
         GavoError: the options, the sequence or its camera are faulty, or there are fewer than two frames.
     """
     if is_live(source.sequence):
-        raise GavoError(f"{source.sequence}: a live source, which `gavo run` alone takes")
+        raise GavoError(f"{source.sequence}: a live source, which only `gavo run` accepts")
     _check_at_least("--start", source.start, 0)
     _check_at_least("--stride", source.stride, 1)
     if source.frames is not None:
         _check_at_least("--frames", source.frames, 2)
     if source.moving and source.sequence != SYNTHETIC:
-        raise GavoError(f"--moving: is of the {SYNTHETIC} room, not of {source.sequence}")
+        raise GavoError(f"--moving: applies only to the {SYNTHETIC} room, not to {source.sequence}")
     if not 0 <= source.moving <= MOST_BODIES:
         raise GavoError(f"--moving: must be from 0 to {MOST_BODIES}, not {source.moving}")
     sequence = open_part(
@@ -80,7 +80,7 @@ def choose_settings(search: SearchOptions) -> NamedSettings:
         for name in ("method", "preset"):
             asked, said = getattr(search, name), getattr(named, name)
             if asked not in (said, getattr(SearchOptions, name)):
-                raise GavoError(f"--{name} {asked}: {search.settings} says {said}: leave one of the two out")
+                raise GavoError(f"--{name} {asked}: {search.settings} says {said}: omit one of them")
     return named._replace(settings=override(named.settings, assignments(search.set), "--set"))
 
 

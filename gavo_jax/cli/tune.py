@@ -30,7 +30,7 @@ def tune(options: Tune) -> int:
     if trials < 1:
         raise GavoError(f"--trials: must be at least 1, not {trials}")
     if TRIAL.fullmatch(options.file.name) and options.file.resolve().parent == tuning.folder.resolve():
-        raise GavoError(f"{options.file}: files of that name are written to {tuning.folder}: choose another --output")
+        raise GavoError(f"{options.file}: tuning writes files of this name to {tuning.folder}; choose another --output")
     folder = prepare_folder(tuning.folder)
     with hold(folder):
         return _search(tuning, options, trials, folder)
@@ -50,7 +50,7 @@ def _search(tuning: Tuning, options: Tune, trials: int, folder: Path) -> int:
     try:
         front = search(tuning, storage, trials, show)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(": the same command goes on from there") from None
+        raise KeyboardInterrupt(": the same command resumes from there") from None
     names = list(tuning.space)
     rows = [_row(choice, names) for choice in front]
     print_table("Pareto front of drift and time", ("trial", "m/s", "ms/pair", *names), rows)

@@ -79,7 +79,7 @@ def empty_argument(arguments: Sequence[str]) -> str | None:
     for before, argument in itertools.pairwise(("", *arguments)):
         if re.fullmatch(r"(--[\w-]+=)?\s*", argument):
             place = argument.strip().removesuffix("=") or before
-            return f"{place}: an empty argument: is a variable not set?".removeprefix(": ")
+            return f"{place}: empty argument; is a variable not set?".removeprefix(": ")
     return None
 
 
@@ -104,7 +104,7 @@ def _in_words(said: str, first: Sequence[str], lines: Sequence[str], arguments: 
     if found := re.match(r"Unrecognized (?:or misplaced )?options: (\S+)", said):
         name = found[1].rstrip(",")
         if name in itertools.dropwhile(lambda word: word != "--", arguments):
-            return f"{name}: stands after --, where options end"
+            return f"{name}: comes after --, which ends the options"
         return _unknown(name, lines, f"gavo {command} --help")
     if said.startswith("Missing from"):
         names = [words[1] for line in first if (words := re.match(r" {4}(\S+)", line))]
@@ -125,16 +125,16 @@ def _in_words(said: str, first: Sequence[str], lines: Sequence[str], arguments: 
 
 def _no_command(arguments: Sequence[str]) -> str:
     if not arguments:
-        return f"a command is missing: one of {', '.join(COMMANDS)}"
+        return f"missing command: expected one of {', '.join(COMMANDS)}"
     near = difflib.get_close_matches(arguments[0], COMMANDS, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"one of {', '.join(COMMANDS)} is needed"
+    hint = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(COMMANDS)}"
     return f"unknown command {arguments[0][:100]!r}; {hint}"
 
 
 def _unknown(name: str, lines: Sequence[str], page: str) -> str:
     """Return the message on an unknown option, with a similar one that the page has, or on a surplus argument."""
     if not name.startswith("-"):
-        return f"one argument too many: {name[:100]!r}"
+        return f"unexpected argument {name[:100]!r}"
     like = ""
     for line in lines:
         if found := re.match(r" +(--[\w-]+)", line):

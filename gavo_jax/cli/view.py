@@ -46,7 +46,7 @@ def view(options: View) -> int:
             for step in run.steps:
                 viewer.watch(_read(sequence, step.index), bodies.restore(step))
     if options.viewer == "save":
-        say(f"written {options.folder / VIEW}")
+        say(f"wrote {options.folder / VIEW}")
     viewer.stay()
     return 0
 
@@ -59,7 +59,7 @@ def _find_search(run: RecordedRun, folder: Path, sequence: Sequence) -> Odometry
         seed = int(run.config["options"]["seed"])
         return Odometry(sequence.camera, settings, seed=seed, record=True)
     except (GavoError, KeyError, TypeError, ValueError) as error:
-        print_message(f"without the search: {error}")
+        print_message(f"shown without the search: {error}")
         return None
 
 
@@ -84,7 +84,7 @@ def _show_with_search(
             bar.advance()
     if apart > SAME:
         off = f"{1e3 * apart:.1f} mm"
-        print_message(f"the search, done once more, comes out up to {off} elsewhere than that of the run")
+        print_message(f"the repeated search differs from that of the run by up to {off}")
 
 
 def _is_of_the_search(step: Step) -> bool:
@@ -111,10 +111,10 @@ def _find_sequence(run: RecordedRun, folder: Path) -> Sequence | None:
         except (KeyError, TypeError) as error:
             raise GavoError(f"{folder / CONFIG}: does not name the sequence: {error}") from None
         if not all(_is_of(step, sequence) for step in run.steps):
-            raise GavoError(f"{source.sequence}: holds other frames than those of the run")
+            raise GavoError(f"{source.sequence}: contains other frames than those of the run")
         return sequence
     except GavoError as error:
-        print_message(f"without images and truth: {error}")
+        print_message(f"shown without images and truth: {error}")
         return None
 
 
@@ -133,7 +133,7 @@ def _recorded_camera(run: RecordedRun, folder: Path) -> Camera:
         camera = Camera(**{**values, "distortion": tuple(values["distortion"])})
         require_camera(camera)
     except (AttributeError, KeyError, TypeError):
-        raise GavoError(f"{folder / CONFIG}: does not tell the camera") from None
+        raise GavoError(f"{folder / CONFIG}: does not name the camera") from None
     except GavoError as error:
         raise GavoError(f"{folder / CONFIG}: {error}") from None
     return camera

@@ -46,7 +46,7 @@ def why_not_private(folder: Path) -> str | None:
     for parent in folder.resolve().parents:
         mode = parent.stat().st_mode
         if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
-            return f"others can put something else in its place: {parent} is open to them"
+            return f"others can put something else in its place, as they can write to {parent}"
     within_reach = (stat.S_IWGRP if top.st_mode & stat.S_IXGRP else 0) | (
         stat.S_IWOTH if top.st_mode & stat.S_IXOTH else 0
     )
@@ -100,12 +100,10 @@ def _is_private(folder: Path, is_named: bool) -> bool:
         fault = why_not_private(folder)
     except OSError as error:
         if is_named:
-            _warn(
-                f"{folder}: cannot be used ({error.strerror or error}): nothing is kept, so every process compiles anew"
-            )
+            _warn(f"{folder}: cannot be used ({error.strerror or error}): no programs are kept")
         return False
     if fault:
-        _warn(f"{folder}: {fault}, and what is kept there is run: nothing is kept; remove it, or close it to others")
+        _warn(f"{folder}: {fault}, and programs kept there are run, so none is kept; remove it, or close it to others")
     return fault is None
 
 

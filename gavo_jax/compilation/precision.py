@@ -77,6 +77,6 @@ def refuse_fork() -> None:
     _process = _process or os.getpid()
     if _process != os.getpid():
         raise GavoError(
-            "this process was forked from one in which JAX has computed, and would wait for ever: start processes with "
+            "this process was forked from one in which JAX has computed, and would hang: start processes with "
             "multiprocessing.get_context('spawn')"
         )

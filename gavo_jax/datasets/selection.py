@@ -53,7 +53,7 @@ def open_part(
         left_out = "".join(f"; {line}" for line in getattr(whole, "left_out", ()))
         raise GavoError(
             f"{source}: start, frames and stride select {len(chosen)} of its {len(whole)} frames: "
-            f"at least 2 are needed{left_out}"
+            f"at least 2 are required{left_out}"
         )
     chosen.check()
     if source != SYNTHETIC and not force and (fault := lack_of_depth(chosen) or fault_of_depth(chosen)):

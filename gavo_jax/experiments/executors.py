@@ -146,7 +146,7 @@ class RayExecutor:
         wanted = options.gpus if options.gpus is not None else min(1.0, most)
         if wanted > most:
             raise GavoError(
-                f"--executor ray: a batch takes {wanted:g} GPU, no node of the cluster has more than {most:g}"
+                f"--executor ray: a batch takes {wanted:g} GPU, but no node of the cluster has more than {most:g}"
             )
         processors = min(options.cpus, max((cpus for cpus, gpus in nodes if gpus >= wanted), default=0.0))
         if not processors and options.cpus:

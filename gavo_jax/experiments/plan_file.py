@@ -112,7 +112,7 @@ def parts_of(path: Path, table: Mapping[str, Any]) -> tuple[list[Part], dict[str
             name = text_of(f"{place}: name", entry.get("name", patterns[0]))
             skipped[name] = f"skipped {name}: {line} (gavo download gets TUM's sequences)"
         if len(found) > 1 and "name" in entry:
-            raise GavoError(f"{place}: name: {len(found)} sequences cannot have one name")
+            raise GavoError(f"{place}: name: {len(found)} sequences cannot share one name")
         parts += [_part(place, path.parent, folder, entry) for folder in found]
     refuse_repeated(f"{path}: sequences", [part.name for part in parts])
     if not parts:

@@ -92,7 +92,7 @@ class Table:
         """
         parquet = _parquet()
         if not self.done():
-            raise GavoError(f"{self.folder.parent}: no results of an experiment: {self._lacking()}")
+            raise GavoError(f"{self.folder.parent}: no experiment results: {self._lacking()}")
         rows = []
         for run in sorted(self.done()):
             path = self.folder / f"{run}{SUFFIX}"
@@ -109,7 +109,7 @@ class Table:
         """Say why there are no rows."""
         if self.folder.is_dir():
             return f"no rows in its folder {ROWS}"
-        return "name the folder above it" if Table(self.folder.parent.parent).done() else f"no folder {ROWS} in it"
+        return "pass the folder above it" if Table(self.folder.parent.parent).done() else f"no folder {ROWS} in it"
 
 
 def _fault(rows: list[dict[str, Any]], run: str) -> str:
@@ -118,10 +118,10 @@ def _fault(rows: list[dict[str, Any]], run: str) -> str:
         return f"{len(rows)} rows"
     (row,) = rows
     if row["run"] != run:
-        return "of another run than its name says"
+        return "belongs to another run than its name says"
     for name in NON_NULL:
         if row[name] is None:
-            return f"without {name}"
+            return f"{name} is missing"
     if not row[FRAMES_PER_SECOND] > 0:
         return f"{FRAMES_PER_SECOND} of {row[FRAMES_PER_SECOND]}"
     for name in MAPPINGS:
@@ -130,7 +130,7 @@ def _fault(rows: list[dict[str, Any]], run: str) -> str:
         except (ValueError, RecursionError):
             value = None
         if not isinstance(value, dict):
-            return f"{name} is no JSON object"
+            return f"{name} is not a JSON object"
     return ""
 
 

@@ -197,16 +197,16 @@ def _refuse_another(study: Any, configuration: dict[str, Any], storage: str) -> 
     if kept is None and not study.get_trials(deepcopy=False):
         study.set_user_attr(CONFIGURATION, json.dumps(configuration))
         return
-    advice = "give this one another name or another --output"
+    advice = "give this study another name or another --output"
     if kept is None:
-        raise GavoError(f"{storage}: the study {study.study_name!r} does not tell what it is of: {advice}")
+        raise GavoError(f"{storage}: the study {study.study_name!r} does not record what it tunes: {advice}")
     there, now = json.loads(kept), json.loads(json.dumps(configuration))
     if set(there["sequences"]) != set(now["sequences"]):
         names = [", ".join(some["sequences"]) for some in (there, now)]
-        raise GavoError(f"{storage}: the study {study.study_name!r} is of {names[0]}, not of {names[1]}: {advice}")
+        raise GavoError(f"{storage}: the study {study.study_name!r} is for {names[0]}, not for {names[1]}: {advice}")
     for name, before, after in differences(there, now):
         raise GavoError(
-            f"{storage}: the study {study.study_name!r} is another one: {name} {before} there, {after} now: {advice}"
+            f"{storage}: the study {study.study_name!r} is a different one ({name} was {before}, now {after}): {advice}"
         )
 
 
@@ -214,9 +214,9 @@ def _refuse_without_drift(name: str, sequence: FrameSequence) -> None:
     """Raise GavoError if no drift can be computed on a sequence, before any trial."""
     lasts = float(np.ptp(sequence.timestamps))
     if sequence.ground_truth is None:
-        raise GavoError(f"{name}: no ground truth, and so no drift to tune by")
+        raise GavoError(f"{name}: no ground truth, so no drift to tune by")
     if lasts < 1:
-        raise GavoError(f"{name}: drift is taken over 1 s, and these frames last {lasts:.2f} s")
+        raise GavoError(f"{name}: drift is measured over 1 s, but these frames last {lasts:.2f} s")
 
 
 def measure(sequences: list[FrameSequence], settings: Settings, seeds: tuple[int, ...]) -> tuple[float, float]:
@@ -234,7 +234,7 @@ def measure(sequences: list[FrameSequence], settings: Settings, seeds: tuple[int
             metrics = run_odometry(sequence, settings, seed=seed).metrics
             drift, is_whole = metrics[DRIFT], metrics["segments"] == 1 and metrics["complete"]
             if drift is None and is_whole:
-                raise GavoError(f"{sequence.name}: no ground truth over a second of it")
+                raise GavoError(f"{sequence.name}: no ground truth over any second of it")
             figures.append((np.inf if drift is None else drift, metrics[MILLISECONDS]))
     drift, milliseconds = np.exp(np.mean(np.log(figures), axis=0))
     return float(drift), float(milliseconds)
@@ -264,7 +264,7 @@ def _bounds(place: str, spec: Any) -> list[Any]:
         raise GavoError(f"{place}: low and high must be numbers, low below high")
     step, log = spec.get("step"), spec.get("log", False)
     if not isinstance(log, bool) or (log and (step is not None or ends[0] <= 0)):
-        raise GavoError(f"{place}: log: true or false; a logarithmic range starts above 0 and has no step")
+        raise GavoError(f"{place}: log: must be true or false; a logarithmic range starts above 0 and has no step")
     if step is not None and (isinstance(step, bool) or not isinstance(step, int | float)):
         raise GavoError(f"{place}: step: must be a number, not {shown(step)}")
     if step is not None and not 0 < step <= ends[1] - ends[0]:

@@ -63,11 +63,11 @@ def _fault_of_values(loss: Loss) -> str:
     if not isinstance(value, jax.Array) or value.shape != s.shape or not jnp.issubdtype(value.dtype, jnp.floating):
         return "must return as many real numbers as it is given"
     if not jnp.isfinite(value).all():
-        return "must be finite, from 0 on"
+        return "must be finite for all values from 0"
     if (value < 0).any():
-        return "must not be negative: a point out of view is told by its cost"
+        return "must not be negative: a point out of view is recognised by its cost"
     if not jnp.isfinite(slope).all():
-        return "must have a finite derivative, at 0 too: covariance and status take it"
+        return "must have a finite derivative, also at 0: covariance and status use it"
     return ""
 
 

@@ -129,5 +129,5 @@ def compute_metrics(
 def _unbroken(trajectory: Trajectory) -> Trajectory:
     """The trajectory; raises GavoError where the motion from its first pose to its last is unknown."""
     if trajectory.segments[0] != trajectory.segments[-1]:
-        raise GavoError("the first pose and the last are of different segments")
+        raise GavoError("the first pose and the last belong to different segments")
     return trajectory

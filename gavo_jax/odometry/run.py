@@ -66,7 +66,7 @@ class OdometryRun:
         from gavo_jax.scene_map import build_map
 
         if self.sequence is None:
-            raise GavoError("the run does not hold the sequence that it was run over: no map can be made of it")
+            raise GavoError("the run does not contain the sequence that it was run over, so no map can be made")
         return build_map(self.sequence, self.steps, shape, voxel, trajectory=self.trajectory)
 
 
@@ -98,7 +98,7 @@ def run_odometry(
     """
     require_sequence(sequence, RUN)
     if len(sequence) < 2:
-        raise GavoError(f"{sequence.name}: an odometry needs at least two frames, not {len(sequence)}")
+        raise GavoError(f"{sequence.name}: odometry needs at least two frames, got {len(sequence)}")
     sequence.check()
     require_parts(sequence)
     sequence = without_distortion(sequence)

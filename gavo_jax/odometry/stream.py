@@ -43,7 +43,7 @@ def track(
     if odometry is None:
         odometry = Odometry(sequence.camera, settings, seed=seed)
     elif not isinstance(odometry, Odometry):
-        raise GavoError(f"an Odometry is needed, not {type(odometry).__name__}: gavo.Odometry(camera, settings)")
+        raise GavoError(f"expected an Odometry, got {type(odometry).__name__}: gavo.Odometry(camera, settings)")
 
     first = odometry.progress.last_index + 1
     for index, frame in enumerate(decoded(sequence, first), start=first):

@@ -51,7 +51,7 @@ def read_bodies(path: Path) -> list[BodyRow]:
     try:
         return [_row(*fields) for fields in csv.reader(read_text(path).splitlines()[1:])]
     except (TypeError, ValueError, csv.Error):
-        raise GavoError(f"{path}: not the bodies of a run") from None
+        raise GavoError(f"{path}: not a table of a run's bodies") from None
 
 
 def _row(timestamp: str, body: str, share: str, *more: str) -> BodyRow:

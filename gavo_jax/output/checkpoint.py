@@ -117,11 +117,11 @@ def load_checkpoint(path: Path, blank: Any) -> Checkpoint:
     except GavoError:
         raise
     except Exception:  # reading damaged archives may raise almost anything
-        raise GavoError(f"{path}: not a whole checkpoint: run again without --resume") from None
+        raise GavoError(f"{path}: damaged or incomplete checkpoint: run again without --resume") from None
     if leaves is None:
         return Checkpoint(progress, files, images)
     if any((a.shape, a.dtype) != (b.shape, b.dtype) for a, b in zip(leaves, expected, strict=True)):
-        raise GavoError(f"{path}: of another camera")
+        raise GavoError(f"{path}: belongs to another camera")
     progress = progress._replace(tracker=jax.tree.unflatten(structure, map(jax.numpy.asarray, leaves)))
     return Checkpoint(progress, files, images)
 

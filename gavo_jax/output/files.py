@@ -129,7 +129,7 @@ def refuse_foreign(folder: Path, file: str, what: str) -> None:
         GavoError: The file exists.
     """
     if (folder / file).exists():
-        raise GavoError(f"{folder}: holds {what} ({file}): name another folder")
+        raise GavoError(f"{folder}: contains {what} ({file}): choose another folder")
 
 
 def remove_files(folder: Path, *names: str) -> None:

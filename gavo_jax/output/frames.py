@@ -62,7 +62,7 @@ def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]
                 raise ValueError("a row is missing")
             for name, stamps in ((TRAJECTORY, by_stamp), (ODOMETRY, found_at)):
                 if _lacks_pose(row, stamps):
-                    of = f"{name} and {FRAMES} are not of the same run"
+                    of = f"{name} and {FRAMES} are not from the same run"
                     raise GavoError(f"{folder}: {of}: no pose at {row['timestamp']}")
             if row["timestamp"] in by_stamp:
                 place = by_stamp[row["timestamp"]]
@@ -189,10 +189,10 @@ def read_run(folder: str | Path) -> RecordedRun:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        fault = "no folder" if folder.exists() else "no such folder"
-        raise GavoError(f"{folder}: {fault}: name the output folder of a run")
+        fault = "not a folder" if folder.exists() else "no such folder"
+        raise GavoError(f"{folder}: {fault}: pass the output folder of a run")
     if not (folder / CONFIG).exists():
-        raise GavoError(f"{folder}: no output folder of `gavo run`: it holds no {CONFIG}")
+        raise GavoError(f"{folder}: not an output folder of `gavo run`: it contains no {CONFIG}")
     config = read_json_object(folder / CONFIG)
     # a killed run with loops has only the poses as tracked
     is_cut_short = not (folder / TRAJECTORY).exists() and (folder / ODOMETRY).exists()
@@ -201,7 +201,7 @@ def read_run(folder: str | Path) -> RecordedRun:
     pairs = read_json_object(folder / METRICS).get("pairs") if (folder / METRICS).exists() else None
     if pairs not in (None, len(steps)):  # metrics.json is written last
         told = f"{len(steps)} pairs in {TRAJECTORY} and {FRAMES}, and {shown(pairs)} in {METRICS}"
-        raise GavoError(f"{folder}: {told}: files cut off, or of another run")
+        raise GavoError(f"{folder}: {told}: files are cut off, or belong to another run")
     return RecordedRun(config, trajectory, revised(steps))
 
 

@@ -36,10 +36,10 @@ def write_masks(folder: Path, step: Step) -> None:
     path = _path(folder, step.timestamp)
     try:
         if path.parent.is_symlink():
-            raise GavoError(f"{path.parent}: a link: what it leads to is not this run's")
+            raise GavoError(f"{path.parent}: is a link: its target does not belong to this run")
         path.parent.mkdir(exist_ok=True)
     except OSError as error:
-        raise GavoError(f"{path.parent}: cannot be made: {error.strerror or error}") from None
+        raise GavoError(f"{path.parent}: cannot be created: {error.strerror or error}") from None
     write_bytes(path, cv2.imencode(".png", labels)[1].tobytes())
 
 

@@ -117,7 +117,7 @@ def _figure(picture: Picture) -> str:
     path = Path(picture.path)
     media_type = MEDIA_TYPES.get(path.suffix.lower())
     if media_type is None:
-        raise GavoError(f"{path}: a report takes figures as {' or '.join(MEDIA_TYPES)}")
+        raise GavoError(f"{path}: figures in a report must be {' or '.join(MEDIA_TYPES)}")
     try:
         data = base64.b64encode(path.read_bytes()).decode("ascii")
     except OSError as error:

@@ -74,7 +74,7 @@ class _GrowingFile:
             raise self._fault(error) from None
         if mark is not None and self.mark() != mark:
             self.close()
-            raise GavoError(f"{path}: not what it was at the checkpoint: run again without --resume")
+            raise GavoError(f"{path}: changed since the checkpoint: run again without --resume")
 
     def append(self, line: str) -> None:
         data = (line + "\n").encode("utf-8")
@@ -152,7 +152,7 @@ class RunFolder:
         except GavoError:
             is_of_run = False
         if found := [] if is_of_run else [path for name in FOREIGN for path in sorted(self.path.glob(name))]:
-            raise GavoError(f"{found[0]}: was left by no run, which would replace it: name another folder")
+            raise GavoError(f"{found[0]}: is not from a run, and this run would replace it: choose another folder")
 
     def start(self, config: Mapping[str, Any], timestamp: float) -> None:
         """Remove an earlier run's files, and write config.json and the first pose, the identity.
@@ -199,18 +199,16 @@ class RunFolder:
             _refuse_another(self.path / CONFIG, config)
         elif kept.exists() or (self.path / METRICS).exists():
             raise GavoError(
-                f"{self.path / CONFIG}: no such file, so that nothing tells of which run the others are: run again "
+                f"{self.path / CONFIG}: no such file, so the other files cannot be matched to a run: run again "
                 "without --resume"
             )
         if not kept.exists():
             return None
         progress, files, images = load_checkpoint(kept, blank)
         if set(files) != set(self._growing(config)):
-            raise GavoError(f"{kept}: not a whole checkpoint: run again without --resume")
+            raise GavoError(f"{kept}: damaged or incomplete checkpoint: run again without --resume")
         if self._seen.up_to(progress.last_index) != images:
-            raise GavoError(
-                f"{kept}: the images are not those that the run has seen before: run again without --resume"
-            )
+            raise GavoError(f"{kept}: the images differ from those that the run has seen: run again without --resume")
         self._open(files)
         remove_files(self.path, METRICS, LOOPS, RECORDING, VIEW, *({TRAJECTORY} - {self._poses}))
         remove_figures(self.path)
@@ -348,7 +346,7 @@ def _refuse_another(path: Path, config: Mapping[str, Any]) -> None:
     now = json.loads(json.dumps(describe(config), allow_nan=False))
     for name, before, after in differences(_identity(earlier), _identity(now)):
         raise GavoError(
-            f"{path}: is of another run, which --resume cannot go on with: {name} {before} there, {after} now"
+            f"{path}: belongs to another run, which --resume cannot continue: {name} was {before}, now {after}"
         )
 
 
@@ -367,4 +365,4 @@ def _last_stamp(path: Path) -> float:
     try:
         return float(rows[-1].split()[0])
     except (IndexError, ValueError):
-        raise GavoError(f"{path}: its last row is no pose") from None
+        raise GavoError(f"{path}: its last row is not a pose") from None

@@ -56,7 +56,9 @@ def write_trajectory(trajectory: Trajectory, path: str | Path, form: str) -> Non
     require_trajectory(trajectory)
     trajectory.require_rigid()
     if not np.isfinite(trajectory.timestamps).all():
-        raise GavoError(f"{path}: pose {np.argmin(np.isfinite(trajectory.timestamps))} has a stamp that is no number")
+        raise GavoError(
+            f"{path}: pose {np.argmin(np.isfinite(trajectory.timestamps))} has a stamp that is not a number"
+        )
     WRITERS[form](trajectory, as_path(path))
 
 
@@ -136,10 +138,10 @@ def write_json_trajectory(trajectory: Trajectory, path: Path) -> None:
 def write_bag(trajectory: Trajectory, path: Path) -> None:
     """Write a ROS 2 bag (SQLite) of `geometry_msgs/PoseStamped` on the topic `/gavo/pose`."""
     if len(trajectory) and not 0 <= trajectory.timestamps.min() <= trajectory.timestamps.max() < LATEST_STAMP:
-        raise GavoError(f"{path}: a ROS bag holds stamps from 0 to {LATEST_STAMP} seconds only")
+        raise GavoError(f"{path}: a ROS bag can only store stamps from 0 to {LATEST_STAMP} seconds")
     rosbag2, typesys = _import_rosbags()
     if path.exists() and not (path / BAG_METADATA).is_file():
-        raise GavoError(f"{path}: is there already, and is no bag")
+        raise GavoError(f"{path}: already exists, and is not a bag")
     partial = partial_of(path)
     try:
         shutil.rmtree(partial, ignore_errors=True)

@@ -56,7 +56,7 @@ WINDOW_SECONDS = 1.0
 """Seconds after which a window that finds no screen has ended."""
 PATIENCE = 60.0
 """Maximum wait, seconds, for a server or window to start or end, and for the last frames to arrive."""
-NOT_STARTED = "Rerun does not start"
+NOT_STARTED = "Rerun did not start"
 GUARD = """
 import os, signal, subprocess, sys, threading
 server = subprocess.Popen([sys.executable, "-m", "rerun", "--serve-web", *sys.argv[1:]], stdin=subprocess.DEVNULL)
@@ -88,7 +88,7 @@ def make_viewer(mode: ViewerMode, recording: Path) -> Viewer:
     if mode == "spawn" and not _has_screen():
         raise GavoError("--viewer spawn: no screen here: use --viewer web or --viewer save")
     if mode == "save" and recording.is_dir():
-        raise GavoError(f"{recording}: cannot be written: a folder lies there")
+        raise GavoError(f"{recording}: cannot be written: it is a folder")
     return RerunViewer(mode, recording)
 
 
@@ -176,7 +176,7 @@ class RerunViewer(Viewer):
         """Serve the browser until Ctrl-C; a window and a file do not need this process."""
         if not self.url:
             return
-        print("the viewer stays until Ctrl-C ends it", flush=True)
+        print("the viewer stays open until Ctrl-C", flush=True)
         try:
             while True:
                 time.sleep(1.0)
@@ -209,7 +209,7 @@ class RerunViewer(Viewer):
             return
         except RuntimeError:
             self._process.terminate()
-        raise RuntimeError("Rerun's window does not open on this screen: use --viewer web or --viewer save")
+        raise RuntimeError("Rerun's window did not open on this screen: use --viewer web or --viewer save")
 
     def _serve(self, stream: RecordingStream) -> None:
         """Serve page and data with Rerun's command, which unlike its Python calls can listen on this machine only."""

@@ -195,19 +195,19 @@ def test_what_does_not_belong_to_the_frames_is_refused_by_name(small_frames: dic
     words: Any = "x"
     ragged: Any = [np.eye(4), np.eye(3)]
     calls: list[tuple[str, Callable[[], Any]]] = [
-        ("Camera is needed, not str", lambda: align(frame, frame, "fr1", NEWTON)),  # pyright: ignore
+        ("expected a Camera, got str", lambda: align(frame, frame, "fr1", NEWTON)),  # pyright: ignore
         ("multiply by 255", lambda: align((bright, frame.depth), frame, CAMERA, NEWTON)),
         ("multiply by 255", lambda: align_batch((bright[None], frame.depth[None]), [frame], CAMERA, NEWTON)),
-        ("key is needed", lambda: align(frame, frame, CAMERA, NEWTON, key=5)),  # pyright: ignore
-        ("a matrix of numbers, not 'x'", lambda: align(frame, frame, CAMERA, NEWTON, guess=words)),
+        ("expected a key", lambda: align(frame, frame, CAMERA, NEWTON, key=5)),  # pyright: ignore
+        ("a matrix of numbers, got 'x'", lambda: align(frame, frame, CAMERA, NEWTON, guess=words)),
         ("a matrix of numbers", lambda: align_batch(two, two, CAMERA, NEWTON, guesses=ragged)),
-        ("guesses are of shape", lambda: align(frame, frame, CAMERA, NEWTON, guess=np.zeros(6))),
-        ("guesses are of shape", lambda: align_batch(two, two, CAMERA, NEWTON, guesses=np.eye(4))),
-        ("guesses are of shape", lambda: align_batch(two, two, CAMERA, NEWTON, guesses=np.tile(np.eye(4), (3, 1, 1)))),
-        ("no rigid motion", lambda: align(frame, frame, CAMERA, NEWTON, guess=np.diag([2.0, 2.0, 2.0, 1.0]))),
-        ("no rigid motion", lambda: align(frame, frame, CAMERA, NEWTON, guess=np.diag([-1.0, 1.0, 1.0, 1.0]))),
-        ("no rigid motion", lambda: align(frame, frame, CAMERA, NEWTON, guess=np.full((4, 4), np.nan))),
-        ("guess 1 is no", lambda: align_batch(two, two, CAMERA, NEWTON, guesses=np.stack([np.eye(4), 0 * np.eye(4)]))),
+        ("guesses have shape", lambda: align(frame, frame, CAMERA, NEWTON, guess=np.zeros(6))),
+        ("guesses have shape", lambda: align_batch(two, two, CAMERA, NEWTON, guesses=np.eye(4))),
+        ("guesses have shape", lambda: align_batch(two, two, CAMERA, NEWTON, guesses=np.tile(np.eye(4), (3, 1, 1)))),
+        ("not a rigid motion", lambda: align(frame, frame, CAMERA, NEWTON, guess=np.diag([2.0, 2.0, 2.0, 1.0]))),
+        ("not a rigid motion", lambda: align(frame, frame, CAMERA, NEWTON, guess=np.diag([-1.0, 1.0, 1.0, 1.0]))),
+        ("not a rigid motion", lambda: align(frame, frame, CAMERA, NEWTON, guess=np.full((4, 4), np.nan))),
+        ("guess 1 is not", lambda: align_batch(two, two, CAMERA, NEWTON, guesses=np.stack([np.eye(4), 0 * np.eye(4)]))),
         ("one per pair", lambda: align_batch(two, two, CAMERA, NEWTON, keys=key)),
         ("one per pair", lambda: align_batch(two, two, CAMERA, NEWTON, keys=jax.random.split(key, 3))),
     ]

@@ -33,9 +33,9 @@ def test_depth_that_is_no_number_is_no_reading_however_it_comes(put: Any) -> Non
 
 def test_what_is_no_frame_is_refused_by_name(small_frames: dict[int, Frame]) -> None:
     frame = small_frames[0]
-    with pytest.raises(GavoError, match="pair \\(grey, depth\\), not ndarray"):
+    with pytest.raises(GavoError, match="pair \\(grey, depth\\), got ndarray"):
         align(frame.grey, frame.depth, CAMERA, NEWTON)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(GavoError, match="lists of frames are needed, or pairs of arrays, not NoneType"):
+    with pytest.raises(GavoError, match="expected lists of frames or pairs of arrays, got NoneType"):
         align_batch(None, None, CAMERA, NEWTON)
     with pytest.raises(GavoError, match="frame_of"):
         align((np.repeat(frame.grey[..., None], 3, axis=2), frame.depth), frame, CAMERA, NEWTON)
@@ -123,11 +123,11 @@ def test_keys_of_both_kinds_are_the_same() -> None:
     assert typed_keys(jax.random.PRNGKey(5), ()) == typed_keys(one, ()) == one
     assert (typed_keys(jax.random.split(jax.random.PRNGKey(5), 2), (2,)) == two).all()
     for wrong in (5, np.zeros(2, np.uint32), jnp.zeros(3, jnp.uint32), jnp.zeros(2), jnp.uint32(3)):
-        with pytest.raises(GavoError, match="a key is needed"):
+        with pytest.raises(GavoError, match="expected a key"):
             typed_keys(wrong, ())
-    with pytest.raises(GavoError, match="a single one is needed"):
+    with pytest.raises(GavoError, match="expected a single key"):
         typed_keys(two, ())
-    with pytest.raises(GavoError, match="one per pair is needed"):
+    with pytest.raises(GavoError, match="expected one per pair"):
         typed_keys(jax.random.PRNGKey(5), (2,))
 
 

@@ -232,7 +232,7 @@ def test_interrupted_run_keeps_what_is_done(gavo, clip, tmp_path, monkeypatch):
     done = gavo("run", clip, "--camera", clip / "camera.toml", *FAST, "--output", tmp_path / "out")
     assert done.status == 130 and "Traceback" not in done.err
     metrics = read_json(tmp_path / "out" / "metrics.json")
-    assert metrics["frames"] == 3 and metrics["complete"] is False and "--resume goes on from there" in done.out
+    assert metrics["frames"] == 3 and metrics["complete"] is False and "--resume to continue from there" in done.out
     assert len(Trajectory.read_tum(tmp_path / "out" / "trajectory.txt")) == 3
 
 
@@ -340,8 +340,8 @@ BAD_OPTIONS = {
     "topic of a folder": (["--depth-topic", "/depth"], ["clip", "--depth-topic", "TUM RGB-D folder"]),
     "no voxel": (["--voxel", "0"], ["voxel", "from"]),
     "negative voxel of a mesh": (["--map-shape", "mesh", "--voxel", "-5"], ["voxel", "not -5"]),
-    "voxel of no map": (["--voxel", "0.02"], ["--voxel", "add --map FILE"]),
-    "shape of no map": (["--map-shape", "mesh"], ["--map-shape", "add --map FILE"]),
+    "voxel of no map": (["--voxel", "0.02"], ["--voxel", "applies only with --map FILE"]),
+    "shape of no map": (["--map-shape", "mesh"], ["--map-shape", "applies only with --map FILE"]),
     "output is a file": (["--output", "clip/rgb.txt"], ["clip/rgb.txt"]),
     "output below a file": (["--output", "clip/rgb.txt/out"], ["clip/rgb.txt/out"]),
 }
@@ -356,14 +356,14 @@ def test_bad_option_is_refused(gavo, clip, name):
 
 
 USAGE = {
-    "": ("a command is missing: one of run, compare,",),
+    "": ("missing command: expected one of run, compare,",),
     "runn": ("unknown command 'runn'; did you mean 'run'?",),
-    "help": ("unknown command 'help'; one of run, compare,",),
+    "help": ("unknown command 'help'; expected one of run, compare,",),
     "run --frame 3": ("unknown option --frame; did you mean --frames? (see gavo run --help)",),
-    "run -- FOLDER --frames 3": ("--frames: stands after --, where options end (see gavo run --help)",),
+    "run -- FOLDER --frames 3": ("--frames: comes after --, which ends the options (see gavo run --help)",),
     "run --xyzzy": ("unknown option --xyzzy (see",),
     "doctor --json": ("unknown option --json (see gavo doctor --help)",),
-    "run one two": ("one argument too many: 'two'",),
+    "run one two": ("unexpected argument 'two'",),
     "run --frames ten": ("--frames: must be a whole number, not 'ten'",),
     "run --seed 1.5": ("--seed: must be a whole number, not '1.5'",),
     "run --voxel 1cm": ("--voxel: must be a number, not '1cm'",),
@@ -392,7 +392,7 @@ def test_usage_error_says_what_would_help(gavo, arguments):
 )
 def test_an_empty_argument_is_not_the_current_folder(gavo, arguments, where):
     """A variable that is not set wrote a run's files wherever the user was."""
-    assert is_refused(gavo(*arguments), f"{where}: an empty argument: is a variable not set?")
+    assert is_refused(gavo(*arguments), f"{where}: empty argument; is a variable not set?")
 
 
 def test_every_command_is_one_that_usage_knows():
@@ -501,7 +501,7 @@ def test_align_takes_no_unit_from_nowhere_where_the_clip_cannot_be_read(gavo, cl
     assert gavo(*command).status == 0
     (clip / "camera.toml").unlink()
     (clip / "intrinsics.txt").write_text(f"{CAMERA.fx} {CAMERA.fy} {CAMERA.cx} {CAMERA.cy}\n")
-    assert is_refused(gavo(*command), "rgb.txt:1", "say --depth-scale")
+    assert is_refused(gavo(*command), "rgb.txt:1", "pass --depth-scale")
     assert gavo(*command, "--depth-scale", CAMERA.depth_scale).status == 0
 
 
@@ -515,7 +515,7 @@ def test_evaluate_refuses(gavo, clip):
     assert is_refused(gavo("evaluate", truth, truth, "--delta", 100), "groundtruth.txt", "100", "--unit frames")
     later = clip / "later.txt"
     later.write_text("9000 0 0 0 0 0 0 1\n9002 0 0 0 0 0 0 1\n")
-    assert is_refused(gavo("evaluate", later, truth), "later.txt", "from 9000.000 to 9002.000 s, the truth from 0.000")
+    assert is_refused(gavo("evaluate", later, truth), "later.txt", "9000.000 to 9002.000 s, the truth 0.000")
 
 
 def stamped(folder: Path, name: str, first: float, unit: float, decimals: int) -> Path:
@@ -534,7 +534,7 @@ def test_evaluate_takes_whole_numbers_for_what_they_count(gavo, tmp_path, first,
         done = gavo("evaluate", *pair, "--json")
         assert done.status == 0, done.err
         assert json.loads(done.out)["ate"]["count"] == 40 and json.loads(done.out)["rpe_translation"]["rmse"] < 1e-6
-    assert f"odd.txt: its stamps are taken for {name}" in gavo("evaluate", odd, usual).out
+    assert f"odd.txt: its stamps are taken as {name}" in gavo("evaluate", odd, usual).out
 
 
 @pytest.mark.parametrize("first", [0.0, 77.0])
@@ -563,7 +563,7 @@ def test_evaluate_tells_quaternions_of_the_other_order(gavo, tmp_path):
     }
     for name, text in lines.items():
         (tmp_path / name).write_text("".join(text))
-    words = "agree once its quaternions are taken as w x y z"
+    words = "agree only if its quaternions are read as w x y z"
     assert f"other: its rotations {words}" in gavo("evaluate", tmp_path / "right", tmp_path / "other").out
     assert words not in gavo("evaluate", tmp_path / "right", tmp_path / "right").out
 
@@ -666,20 +666,20 @@ def test_view_compares_motions_of_the_search_alone(monkeypatch, capsys, lost, or
     driver: Any = SimpleNamespace(warm_up=lambda: 0.0)
     unmoved: Any = None
     view._show_with_search(run, unmoved, SyntheticSequence(2), driver, NO_VIEWER)
-    assert ("elsewhere" in capsys.readouterr().err) == (origin == "tracked")
+    assert ("the repeated search differs" in capsys.readouterr().err) == (origin == "tracked")
 
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("fault", ["frames.csv", "trajectory.txt", "config.json"])
 def test_view_refuses_what_is_no_run(gavo, clip, tmp_path, fault):
     assert is_refused(gavo("view", "nowhere"), "nowhere: no such folder", "output folder")
-    assert is_refused(gavo("view", clip / "camera.toml"), "camera.toml: no folder", "output folder")
+    assert is_refused(gavo("view", clip / "camera.toml"), "camera.toml: not a folder", "output folder")
     assert gavo("run", clip, "--camera", clip / "camera.toml", *FAST, "--output", "out").status == 0
     path = tmp_path / "out" / fault
     path.write_text("index\n7\n" if fault == "frames.csv" else "{")
     assert is_refused(gavo("view", "out", "--viewer", "save"), fault)
     path.unlink()
-    why = "no output folder of `gavo run`" if fault == "config.json" else "no such file"
+    why = "not an output folder of `gavo run`" if fault == "config.json" else "no such file"
     assert is_refused(gavo("view", "out", "--viewer", "save"), fault, why)
     assert not (tmp_path / "out" / "view.rrd").exists()
 
@@ -688,9 +688,7 @@ def test_a_method_that_the_settings_contradict_is_told(gavo, pristine, tmp_path)
     """What the file names counts, and the option was left aside without a word."""
     (tmp_path / "own.toml").write_text('method = "gauss-newton"\npreset = "fast"\n')
     source = ("run", pristine, "--camera", pristine / "camera.toml", "--settings", tmp_path / "own.toml")
-    assert is_refused(
-        gavo(*source, "--method", "pso"), "--method pso: ", "says gauss-newton", "leave one of the two out"
-    )
+    assert is_refused(gavo(*source, "--method", "pso"), "--method pso: ", "says gauss-newton", "omit one of them")
     assert is_refused(gavo(*source, "--preset", "wide"), "--preset wide: ", "says fast")
 
 
@@ -744,7 +742,7 @@ def test_results_of_two_kinds_do_not_share_a_folder(gavo, pristine, tmp_path):
         (("evaluate", truth, truth, "--plot", tmp_path / "both"), "comparison"),
         (("run", *source, "--method", "gauss-newton", "--output", tmp_path / "both"), "comparison"),
     ):
-        assert is_refused(gavo(*arguments), f"holds a {word}", "name another folder")
+        assert is_refused(gavo(*arguments), f"contains a {word}", "choose another folder")
 
 
 @pytest.mark.parametrize(
@@ -840,7 +838,7 @@ def test_no_text_of_an_option_has_lines_of_its_own():
 
 
 def test_help_tells_what_an_option_does_once_it_is_given(gavo):
-    assert "Do not track the frames once more" in " ".join(gavo("view", "--help").out.replace("│", "").split())
+    assert "Do not track the frames again" in " ".join(gavo("view", "--help").out.replace("│", "").split())
     for words in (("experiment", "--help"), ("experiment", "report", "--help")):
         assert "{FILE.toml,report} [DIR]" in gavo(*words).out.splitlines()[0]
 

@@ -63,7 +63,7 @@ def test_doctor_tells_a_wrong_number(gavo, monkeypatch):
     done = gavo("doctor")
     assert done.status == 1 and "check WRONG: inverse of 300 motions: off by " in done.out
     assert "check ok: warp of 300 points" in done.out
-    assert done.out.endswith("not as it should be: inverse of 300 motions\n")
+    assert done.out.endswith("problems found: inverse of 300 motions\n")
 
 
 def test_doctor_tells_packages_that_cannot_be_loaded(gavo, monkeypatch):
@@ -77,14 +77,14 @@ def test_doctor_tells_packages_that_cannot_be_loaded(gavo, monkeypatch):
     for what in ("method", "dataset"):
         assert f"plugin: WRONG: {what} 'broken' of no_such_package:KIND: cannot be loaded: No module" in done.out
     assert done.status == 1 and not done.err
-    assert done.out.endswith("not as it should be: packages that bring methods or datasets\n")
+    assert done.out.endswith("problems found: packages that bring methods or datasets\n")
 
 
 def test_doctor_tells_a_compiler_that_is_ruled_out(gavo, monkeypatch):
     monkeypatch.setattr(compiler, "unfit_compiler", lambda: RULED_OUT)
     done = gavo("doctor")
     assert done.status == 1 and f"compiler: WRONG: {RULED_OUT}\n" in done.out and not done.err
-    assert done.out.endswith("not as it should be: the version of JAX\n")
+    assert done.out.endswith("problems found: the version of JAX\n")
 
 
 @pytest.mark.filterwarnings("ignore:.*nothing is kept:gavo_jax.GavoWarning")
@@ -94,7 +94,7 @@ def test_doctor_tells_a_cache_that_keeps_nothing(gavo, tmp_path, monkeypatch):
     monkeypatch.setenv("GAVO_CACHE_DIR", str(file / "cache"))
     done = gavo("doctor")
     assert done.status == 1 and "NOT writable" in done.out
-    assert done.out.endswith("not as it should be: the cache folder\n")
+    assert done.out.endswith("problems found: the cache folder\n")
 
 
 @pytest.mark.parametrize(

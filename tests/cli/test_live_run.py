@@ -78,7 +78,7 @@ def test_a_live_run_writes_what_every_run_writes(tmp_path, capsys, monkeypatch):
     expected = run_odometry(FRAMES, NEWTON).trajectory
     assert abs(trajectory.world_T_camera - expected.world_T_camera).max() < 1e-6
     assert (tmp_path / "run" / "trajectory.json").exists()
-    assert "0 of 5 frames came while another was tracked" in done.out
+    assert "0 of 5 frames were dropped" in done.out
 
 
 def test_a_camera_that_is_not_used_after_all_is_let_go(tmp_path, capsys):
@@ -124,7 +124,7 @@ def test_a_device_that_gives_one_frame_says_how_many_were_tracked(tmp_path, caps
     monkeypatch.setattr("gavo_jax.cli.live.Newest", Unhurried)
     register_device("player", lambda: Player(frames=[FRAMES[0]]))
     done = runner(capsys)("run", "player", "--method", "small-newton", "--output", tmp_path)
-    assert done.status == 2 and "player: ended after 1 frames: at least two are needed" in done.err
+    assert done.status == 2 and "player: ended after 1 frames: needs at least two" in done.err
 
 
 @pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="Rerun is not installed")
@@ -189,10 +189,10 @@ def test_a_lens_that_is_named_leaves_the_devices_unit_of_depth(tmp_path, capsys,
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("player", "--rate", "15"), "--rate: not with the live source 'player'"),
-        (("player", "--resume"), "--resume: not with the live source 'player'"),
-        (("player", "--loops"), "--loops: not with the live source 'player'"),
-        (("player", "--map", "a.xyz"), "a.xyz: a map ends in .ply"),
+        (("player", "--rate", "15"), "--rate: not available for the live source 'player'"),
+        (("player", "--resume"), "--resume: not available for the live source 'player'"),
+        (("player", "--loops"), "--loops: not available for the live source 'player'"),
+        (("player", "--map", "a.xyz"), "a.xyz: the name of a map must end in .ply"),
         (("player", "--frames", "1"), "at least 2"),
         (("empty",), "ended after 0 frames"),
         (("odd",), "colour image is uint8 of shape"),
@@ -213,4 +213,4 @@ def test_other_commands_say_that_live_frames_are_not_for_them(command, tmp_path,
     monkeypatch.chdir(tmp_path)
     register_device("player", Player)
     done = runner(capsys)(*command)
-    assert done.status == 2 and "player: a live source, which `gavo run` alone takes" in done.err
+    assert done.status == 2 and "player: a live source, which only `gavo run` accepts" in done.err

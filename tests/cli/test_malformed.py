@@ -76,7 +76,7 @@ FOLDERS: dict[str, tuple[str, Callable[[Path], object], list[str]]] = {
     "tum: a list in UTF-16": (
         "tum",
         write("rgb.txt", f"0.0 rgb/{FIRST}\n".encode("utf-16")),
-        ["rgb.txt", "not a text file (UTF-8)", "write it in UTF-8"],
+        ["rgb.txt", "not a text file (UTF-8)", "save it as UTF-8"],
     ),
     "tum: stamps of another day": (
         "tum",

@@ -141,8 +141,8 @@ def test_a_changed_experiment_is_told_apart_from_what_it_was(gavo, monkeypatch):
     assert now[label.format(0.003)][0] == "3" and now[label.format(0.002)][0] == "3" and now["opencv-rgb"][0] == "1"
     assert rows_of(earlier)[label.format(0.002)][0] == "3"
     assert f"{label.format(0.003)} / opencv-rgb" in done.out and "all sequences" not in done.out
-    assert "4 of 11 runs are of earlier versions of the experiment's file" not in done.out
-    assert "7 of 11 runs are of earlier versions of the experiment's file." in done.out
+    assert "4 of 11 runs are from earlier versions of the experiment's file" not in done.out
+    assert "7 of 11 runs are from earlier versions of the experiment's file." in done.out
     again = gavo("experiment", "report", "out")
     assert again.out.splitlines()[:3] == done.out[done.out.index("\nroom\n") + 1 :].splitlines()[:3]
 
@@ -153,14 +153,14 @@ def test_a_study_of_something_else_is_not_gone_on_with(gavo, tmp_path, monkeypat
     assert gavo("tune", write("t.toml", TUNING, **first), "--output", "out").status == 0
     before = (tmp_path / "out" / "front.json").read_bytes()
     for change, words in (
-        ({"frames": 36}, "sequences.clip.frames 34 there, 36 now"),
+        ({"frames": 36}, "sequences.clip.frames was 34, now 36"),
         ({"choices": ["huber"]}, "space.alignment.loss"),
     ):
         done = gavo("tune", write("t.toml", TUNING, **first | change), "--output", "out")
         assert done.status == 2 and done.err.count("\n") == 1 and words in done.err, done.err
         assert (tmp_path / "out" / "front.json").read_bytes() == before
     other = write("t.toml", TUNING.replace('name = "clip"', 'name = "hall"'), **first)
-    assert "is of clip, not of hall: give" in gavo("tune", other, "--output", "out").err
+    assert "is for clip, not for hall: give" in gavo("tune", other, "--output", "out").err
     (tmp_path / "out" / "trial-99.toml").write_text("of an earlier front")
     own = write("out/trial-desk.toml", TUNING, **first | {"trials": 2})
     assert gavo("tune", own, "--output", "out").status == 0

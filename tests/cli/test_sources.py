@@ -117,8 +117,8 @@ def test_a_pair_is_aligned_whatever_is_wrong_with_the_rest_of_its_source(gavo, c
 def test_a_folder_in_the_place_of_a_file_is_refused_before_the_run(gavo, clip):
     Path("map.ply").mkdir()
     Path("camera.toml").mkdir()
-    assert is_refused(gavo("run", clip, *FAST, "--map", "map.ply", "--output", "out"), "map.ply: a folder")
-    assert is_refused(gavo("calibrate", clip), "camera.toml: a folder") and not Path("out").exists()
+    assert is_refused(gavo("run", clip, *FAST, "--map", "map.ply", "--output", "out"), "map.ply: is a folder")
+    assert is_refused(gavo("calibrate", clip), "camera.toml: is a folder") and not Path("out").exists()
 
 
 def test_a_folder_that_is_closed_to_the_map_is_told_before_the_run(gavo, clip, monkeypatch):
@@ -132,7 +132,7 @@ def test_calibrate_replaces_no_camera_file_that_nobody_named(gavo, clip, monkeyp
     """In the folder of a sequence that file may be the dataset's own."""
     monkeypatch.chdir(clip)
     before = Path("camera.toml").read_bytes()
-    assert is_refused(gavo("calibrate", "."), "camera.toml: is there already", "--output")
+    assert is_refused(gavo("calibrate", "."), "camera.toml: already exists", "--output")
     assert Path("camera.toml").read_bytes() == before
 
 
@@ -152,7 +152,7 @@ def test_inspect_tells_of_depth_that_stands_still(gavo, clip):
     done = gavo("inspect", clip)
     assert (
         done.status == 0
-        and "frames used: 8 of 8\nof these, 7 frozen: depth repeats that of the frame before" in done.out
+        and "frames used: 8 of 8\nof these, 7 frozen: depth repeats that of the previous frame" in done.out
     )
 
 
@@ -164,7 +164,7 @@ def test_inspect_tells_of_an_image_that_stands_still_in_part(gavo, clip):
     image[60:] = before[60:]
     assert cv2.imwrite(str(last), image)
     done = gavo("inspect", clip)
-    assert done.status == 0 and "\nof these, 1 moving_body: a part of the image repeats the one before" in done.out
+    assert done.status == 0 and "\nof these, 1 moving_body: part of the image repeats the previous one" in done.out
 
 
 def test_inspect_tells_of_depth_that_is_mirrored(gavo, data_dir, tmp_path):
@@ -179,7 +179,7 @@ def test_inspect_tells_of_depth_that_is_mirrored(gavo, data_dir, tmp_path):
         assert depth is not None and cv2.imwrite(str(folder / "depth" / file.name), depth[:, ::-1])
     done = gavo("inspect", folder, "--camera", "fr1")
     assert done.status == 0
-    assert "depth image: WRONG? mirrored beside the colour image, by the edges of both\n" in done.out
+    assert "depth image: WRONG? mirrored relative to the colour image, judging by the edges of both\n" in done.out
     assert "WRONG" not in gavo("inspect", source, "--frames", 21, "--camera", "fr1").out
 
 
@@ -189,7 +189,7 @@ def test_inspect_does_not_say_that_a_frame_after_a_gap_is_used_in_part(gavo, cli
         rows = path.read_text().splitlines()
         path.write_text("\n".join(rows[:-4] + rows[-1:]) + "\n")
     done = gavo("inspect", clip)
-    assert done.status == 0 and "of these, 1 gap: frames are missing before; used in full\n" in done.out
+    assert done.status == 0 and "of these, 1 gap: frames are missing before it; used in full\n" in done.out
     assert re.search(r"frames/s, 1 gap of \d\.\d\d s\n", done.out)
 
 
@@ -372,7 +372,7 @@ def test_without_a_truth_it_is_said_what_the_trajectory_tells(gavo, clip, truth)
         (clip / "groundtruth.txt").write_text("".join(f"9{row}\n" for row in rows[1:]))
     done = gavo("run", clip, *FAST, "--output", "out")
     assert done.status == 0, done.err
-    assert ("No ground truth" if truth == "none" else "covers no two") in done.out
+    assert ("No ground truth" if truth == "none" else "covers fewer than two") in done.out
     assert done.out.count("┏") == 1 and max(map(len, (x for x in done.out.splitlines() if x[:1] in "┃│"))) <= 80
     table = {
         line.split("\u2502")[1].strip(): line.split("\u2502")[2] for line in done.out.splitlines() if "\u2502" in line

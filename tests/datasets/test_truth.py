@@ -219,7 +219,7 @@ FAULTS = {
     "another's numbers": ("trajectory.log", log(POSES[:2], [70, 80]), "trajectory.log: none of its frames"),
     "icl of prose": ("x.gt.freiburg", "x y\n", "x.gt.freiburg:1: expected 8 numbers"),
     "icl of stamps": ("x.gt.freiburg", "0.5 0 0 0 0 0 0 1\n", "x.gt.freiburg: expected frame numbers"),
-    "icl, empty": ("x.gt.freiburg", "", "x.gt.freiburg: holds no trajectory"),
+    "icl, empty": ("x.gt.freiburg", "", "x.gt.freiburg: contains no trajectory"),
 }
 
 

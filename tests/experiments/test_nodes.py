@@ -37,7 +37,7 @@ def executor_on(monkeypatch):
 
 def test_a_batch_that_no_node_can_run_is_refused(executor_on):
     """It waited for ever, as the nodes together had enough."""
-    with pytest.raises(GavoError, match="a batch takes 2 GPU, no node of the cluster has more than 1"):
+    with pytest.raises(GavoError, match="a batch takes 2 GPU, but no node of the cluster has more than 1"):
         executor_on([(4.0, 1.0), (4.0, 1.0)], gpus=2.0)
     with pytest.raises(GavoError, match="a batch takes 2 CPU"):
         executor_on([(0.0, 0.0)])

@@ -150,8 +150,8 @@ def test_command(small, tmp_path, capsys):
     "arguments, words",
     [
         (["experiment", "nowhere.toml"], ["nowhere.toml", "no such file"]),
-        (["experiment", "report", "nowhere"], ["nowhere", "no results"]),
-        (["experiment", "report"], ["which folder"]),
+        (["experiment", "report", "nowhere"], ["nowhere", "no experiment results"]),
+        (["experiment", "report"], ["no folder given"]),
         (["experiment", "report", "nowhere", "--dry-run"], ["report", "--dry-run"]),
         (["experiment", "report", "nowhere", "--output", "there"], ["report", "--output"]),
         (["tune", "nowhere.toml"], ["nowhere.toml"]),
@@ -227,7 +227,7 @@ def test_an_interrupted_study_says_how_it_goes_on(tuned, tmp_path, capsys, monke
 
     monkeypatch.setattr("gavo_jax.cli.tune.search", stopped)
     assert main(["tune", str(tuned), "--output", str(tmp_path / "study")]) == 130
-    assert capsys.readouterr().err == "gavo: interrupted: the same command goes on from there\n"
+    assert capsys.readouterr().err == "gavo: interrupted: the same command resumes from there\n"
 
 
 def test_the_setting_says_whether_a_range_is_of_whole_numbers(tuned, tmp_path, monkeypatch):

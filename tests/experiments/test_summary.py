@@ -36,7 +36,7 @@ def test_median_and_quartiles():
 
 def test_a_method_that_got_lost_does_not_speak_for_the_sequence():
     table = summarise(rows("desk", "ga", [0.01, 0.02]) + rows("desk", "orb-pnp", [None, None]))
-    assert _without_drift(table) == ["No drift of desk by orb-pnp: no part that it followed lasts 1 s."]
+    assert _without_drift(table) == ["No drift of desk by orb-pnp: no tracked part lasts 1 s."]
     (alone,) = _without_drift(summarise(rows("desk", "orb-pnp", [None])))
     assert alone.startswith("No drift of desk: no two frames")
 

@@ -71,13 +71,13 @@ def test_a_torn_file_is_named_and_a_partial_one_is_no_row(tmp_path):
 def test_no_table(tmp_path):
     """The message named a folder that is not there."""
     where = re.escape(str(tmp_path))
-    with pytest.raises(GavoError, match=f"^{where}: no results of an experiment: no folder runs in it$"):
+    with pytest.raises(GavoError, match=f"^{where}: no experiment results: no folder runs in it$"):
         Table(tmp_path).read()
     (tmp_path / ROWS).mkdir()
-    with pytest.raises(GavoError, match=f"^{where}: no results of an experiment: no rows in its folder runs$"):
+    with pytest.raises(GavoError, match=f"^{where}: no experiment results: no rows in its folder runs$"):
         Table(tmp_path).read()
     Table(tmp_path).append(row("a"))
-    with pytest.raises(GavoError, match=f"^{where}/runs: no results of an experiment: name the folder above it$"):
+    with pytest.raises(GavoError, match=f"^{where}/runs: no experiment results: pass the folder above it$"):
         Table(tmp_path / ROWS).read()
 
 

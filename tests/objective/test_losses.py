@@ -39,13 +39,13 @@ class Unhashable:
 @pytest.mark.parametrize(
     ("loss", "words"),
     [
-        (jnp.sqrt, "must have a finite derivative, at 0 too"),
+        (jnp.sqrt, "must have a finite derivative, also at 0"),
         (lambda s: 1, "must return as many real numbers as it is given"),
         (jnp.sum, "must return as many real numbers"),
         (lambda s: s > 4, "must return as many real numbers"),
         (lambda s: (s, s), "must return as many real numbers"),
         (lambda s: -jnp.exp(-s), "must not be negative"),
-        (jnp.log, "must be finite, from 0 on"),
+        (jnp.log, "must be finite for all values from 0"),
         (lambda s: np.sqrt(s), "cannot be used: "),
         (lambda s: jax.pure_callback(np.abs, s, s), "cannot be used: Pure callbacks do not support JVP"),
         (lambda: 0, "cannot be used: "),

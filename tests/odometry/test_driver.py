@@ -245,7 +245,7 @@ def test_a_frozen_image_stands_still(sequence: SyntheticSequence, plain_run: Odo
     frozen = Altered(sequence, lambda i, f: replace(sequence[4], timestamp=f.timestamp) if i == 5 else f)
     result = run(frozen)
     assert result.steps[4].alignment.status is AlignmentStatus.FROZEN
-    assert result.steps[4].alignment.sentence == "The image is the last one once more."
+    assert result.steps[4].alignment.sentence == "The image repeats the last one."
     np.testing.assert_array_equal(result.steps[4].world_T_camera, result.steps[3].world_T_camera)
     assert [step.index for step in result.steps if step.lost] == [5]
     assert errors(result, sequence)[6:].max() < errors(plain_run, sequence).max() + 0.004

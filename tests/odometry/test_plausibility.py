@@ -214,7 +214,7 @@ def test_depth_that_stands_still_is_told_and_does_no_harm(frames: list[Frame]) -
     assert [Status.FROZEN in step.alignment.statuses for step in steps] == [11 <= i < 14 for i in range(23)]
     assert not any(step.lost for step in steps)
     assert [step.alignment.frozen for step in steps[10:15]] == ["", "depth", "depth", "depth", ""]
-    assert steps[11].alignment.sentence == "The depth is the last one once more."
+    assert steps[11].alignment.sentence == "The depth repeats the last one."
     assert np.abs(steps[-1].world_T_camera - clean[-1].world_T_camera).max() < 5e-3
 
 

@@ -27,7 +27,7 @@ def test_what_is_no_sequence_is_refused_by_name():
         for call in (run_odometry, lambda wrong: list(track(wrong, small.NEWTON))):
             with pytest.raises(GavoError, match="expected a Sequence, got [a-zA-Z_]+: "):
                 call(wrong)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(GavoError, match="Camera is needed"):
+    with pytest.raises(GavoError, match="expected a Camera"):
         Odometry("fr1")  # pyright: ignore[reportArgumentType]
     odometry = Odometry(small.CAMERA, small.NEWTON)
     dark = frames[0].grey / np.float32(255.0)
@@ -57,7 +57,7 @@ class Own:
     [
         ({"check": None, "name": None}, "Own is not a Sequence: it has no name, check"),
         ({"timestamps": np.arange(2.0)}, r"Own: timestamps: .*3 frames"),
-        ({"camera": "fr1"}, "a Camera is needed"),
+        ({"camera": "fr1"}, "expected a Camera"),
         ({"ground_truth": "groundtruth.txt"}, "Own: ground_truth: expected a Trajectory or None"),
         ({}, "frame 0: not there"),
     ],

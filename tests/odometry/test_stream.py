@@ -27,7 +27,7 @@ def test_on_lost_stop_ends_the_run(sequence: SyntheticSequence) -> None:
 
 def test_what_is_no_driver_is_refused(sequence: SyntheticSequence) -> None:
     driver: Any = PLAIN
-    with pytest.raises(GavoError, match=r"an Odometry is needed, not OdometryOptions: gavo\.Odometry\(camera"):
+    with pytest.raises(GavoError, match=r"expected an Odometry, got OdometryOptions: gavo\.Odometry\(camera"):
         next(track(sequence, odometry=driver))
 
 

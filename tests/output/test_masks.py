@@ -90,7 +90,7 @@ def test_a_run_replaces_no_files_that_a_run_did_not_leave(tmp_path: Path, name: 
     for file in (name, "config.json"):
         (tmp_path / file).parent.mkdir(exist_ok=True)
         (tmp_path / file).write_text("{}")
-    with RunFolder(tmp_path) as folder, pytest.raises(GavoError, match="was left by no run"):
+    with RunFolder(tmp_path) as folder, pytest.raises(GavoError, match="is not from a run"):
         folder.start({"odometry": OdometryOptions()}, 0.0)
     assert (tmp_path / name).exists()
     (tmp_path / "config.json").write_text('{"odometry": {}}')
@@ -129,7 +129,7 @@ def test_a_recorded_run_gets_its_bodies_back(tmp_path: Path):
     np.testing.assert_allclose(again.centroid, [11.0, 2.0, 3.0])
     np.testing.assert_allclose(again.displacement, seen.displacement)
     (tmp_path / "bodies.csv").write_text("timestamp\n1.0,2,x\n")
-    with pytest.raises(GavoError, match=r"bodies\.csv: not the bodies of a run"):
+    with pytest.raises(GavoError, match=r"bodies\.csv: not a table of a run's bodies"):
         RecordedBodies(tmp_path)
 
 

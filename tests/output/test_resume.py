@@ -180,7 +180,7 @@ def test_interrupted_run_is_resumed(clip, whole, tmp_path, monkeypatch):
 def test_nothing_to_resume(clip, whole, tmp_path, capsys):
     """An empty folder is a run from the start; of a run that came to its end nothing is touched."""
     assert main(arguments(clip, tmp_path / "out", "--resume")) == 0
-    assert f"nothing to resume in {tmp_path / 'out'}: a new run\n" in capsys.readouterr().out
+    assert f"nothing to resume in {tmp_path / 'out'}: starting a new run\n" in capsys.readouterr().out
     assert same_ending(tmp_path / "out", whole)
     before = {path: path.read_bytes() for path in (tmp_path / "out").iterdir()}
     assert main(arguments(clip, tmp_path / "out", "--resume")) == 0
@@ -210,8 +210,8 @@ def broken(cut, tmp_path) -> Path:
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (("--seed", "1"), ("seed 0 there, 1 now",)),
-        (("--frames", "20"), ("sequence.frames 40 there, 20 now",)),
+        (("--seed", "1"), ("seed was 0, now 1",)),
+        (("--frames", "20"), ("sequence.frames was 40, now 20",)),
         (("--on-lost", "predict"), ("odometry.on_lost",)),
         (("--preset", "fast"), ("config.json",)),
     ],
@@ -308,7 +308,7 @@ def test_a_damaged_checkpoint_is_always_one_line(tmp_path):
         try:
             found = load_checkpoint(path, blank)
         except GavoError as fault:
-            refused += "not a whole checkpoint" in str(fault) or "larger than" in str(fault)
+            refused += "damaged or incomplete checkpoint" in str(fault) or "larger than" in str(fault)
         else:
             assert found.progress.last_index == 3 and found.files == {"frames.csv": Mark(7, "")}
             refused += 1
@@ -338,7 +338,7 @@ def test_images_that_changed_are_noticed(clip, tmp_path, monkeypatch, capsys, un
     capsys.readouterr()
     assert main(arguments(own, tmp_path / "out", "--resume")) == 2
     error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "images are not those" in error
+    assert error.count("\n") == 1 and "the images differ from those" in error
 
 
 def test_a_finished_run_that_nothing_tells_of_is_not_shown_for_another(whole, clip, tmp_path, capsys):

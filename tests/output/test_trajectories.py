@@ -76,12 +76,12 @@ def test_bag_holds_the_poses_and_is_replaced(tmp_path):
 
 
 def test_what_cannot_be_written_is_one_line(tmp_path):
-    with pytest.raises(GavoError, match="a Trajectory is needed, not ndarray"):
+    with pytest.raises(GavoError, match="expected a Trajectory, got ndarray"):
         write_trajectory(TRAJECTORY.world_T_camera, tmp_path / "t.txt", "tum")  # pyright: ignore[reportArgumentType]
     with pytest.raises(GavoError, match="not one of tum, kitti, euroc, json, bag"):
         formats("tum,klm")
     (tmp_path / "bag").mkdir()
-    with pytest.raises(GavoError, match="is no bag"):
+    with pytest.raises(GavoError, match="is not a bag"):
         write_trajectory(TRAJECTORY, tmp_path / "bag", "bag")
     early = Trajectory(STAMPS - 2e9, TRAJECTORY.world_T_camera)
     with pytest.raises(GavoError, match="stamps from 0"):
@@ -97,7 +97,9 @@ def test_an_earlier_runs_files_are_removed(tmp_path):
 
 
 @pytest.mark.parametrize("form", [form for form in FILES if form != "bag"])
-@pytest.mark.parametrize(("stamp", "scale", "words"), [(1.0, 2.0, "no rigid transform"), (np.nan, 1.0, "no number")])
+@pytest.mark.parametrize(
+    ("stamp", "scale", "words"), [(1.0, 2.0, "not a rigid transform"), (np.nan, 1.0, "not a number")]
+)
 def test_what_is_no_trajectory_is_not_written(tmp_path, form, stamp, scale, words):
     trajectory = Trajectory(np.array([0.0, stamp]), scale * np.stack([np.eye(4)] * 2))
     with pytest.raises(GavoError, match=words):

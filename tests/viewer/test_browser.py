@@ -86,7 +86,7 @@ def test_web_viewer_draws_a_run(photograph, tmp_path):
         )
         try:
             deadline = time.monotonic() + 300
-            while "Ctrl-C ends it" not in (text := (tmp_path / "log").read_text()):
+            while "open until Ctrl-C" not in (text := (tmp_path / "log").read_text()):
                 assert run.poll() is None and time.monotonic() < deadline, text
                 time.sleep(1.0)
             [url] = set(re.findall(r"viewer at (\S+)", text))

@@ -344,7 +344,7 @@ def test_missing_package_and_missing_screen_are_said(tmp_path, monkeypatch):
 
 def test_a_folder_where_the_recording_belongs_is_told_before_the_run(tmp_path):
     (tmp_path / "run.rrd").mkdir()
-    with pytest.raises(GavoError, match=r"run\.rrd: cannot be written: a folder lies there"):
+    with pytest.raises(GavoError, match=r"run\.rrd: cannot be written: it is a folder"):
         live.make_viewer("save", tmp_path / "run.rrd")
 
 

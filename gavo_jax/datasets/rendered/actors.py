@@ -139,7 +139,7 @@ def box(name: str, size: tuple[float, float, float], path: Path, texture: str = 
         GavoError: the size is not three numbers, or `Box` has no such field.
     """
     if np.shape(size) != (3,):
-        raise GavoError(f"box {shown(name)}: size: three edge lengths are needed, not {shown(size)}")
+        raise GavoError(f"box {shown(name)}: size: expected three edge lengths, got {shown(size)}")
     if unknown := [field for field in look if field not in _LOOK]:
         raise GavoError(f"box {shown(name)}: {unknown[0]}: not one of {', '.join(_LOOK)}")
     return MovingBody(name, (MovingPart((Box((0.0, 0.0, -size[2] / 2), size, texture, **look),), path),))
@@ -160,7 +160,7 @@ def figure(name: str, walk: Walk, tall: float = _GROWN_UP, phase: float = 0.0) -
     if not as_number(f"figure {shown(name)}: tall", tall) > 0:
         raise GavoError(f"figure {shown(name)}: tall: must be above 0, not {tall}")
     if not hasattr(walk, "speed"):
-        raise GavoError(f"figure {shown(name)}: a Walk is needed, not {shown(walk)}")
+        raise GavoError(f"figure {shown(name)}: expected a Walk, got {shown(walk)}")
     scale = tall / _GROWN_UP
     rate = walk.speed / (1.3 * scale)
 

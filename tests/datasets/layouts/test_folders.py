@@ -291,7 +291,7 @@ def test_a_unit_that_nothing_says_is_called_a_guess(folder, scale, is_guess):
         image(folder / f"depth/{i}.png", raw(metres, 6553.5))
     (folder / "camera.toml").write_text(CAMERA_TOML)
     sequence = open_source(folder, Reading(depth_scale=scale))
-    assert ("millimetres, a guess: say --depth-scale" in summary(sequence)) == is_guess
+    assert ("millimetres, a guess: pass --depth-scale" in summary(sequence)) == is_guess
 
 
 @pytest.mark.parametrize("name", ["seven_scenes", "plain", "associations", "tartan_air_2"])

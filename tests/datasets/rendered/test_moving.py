@@ -156,7 +156,7 @@ def test_a_written_folder_tells_the_truth(moving: SyntheticSequence, tmp_path) -
     ("bodies", "word"),
     [
         (-1, "bodies"),
-        (1.5, "bodies: a whole number is needed, not 1.5"),
+        (1.5, "bodies: expected a whole number, got 1.5"),
         ("2", "bodies: expected a MovingBody, got str"),
         ([1], "bodies: expected a MovingBody, got int"),
         ([MovingBody("whole", 1)], "bodies: 'int' object is not iterable"),  # pyright: ignore[reportArgumentType]
@@ -183,11 +183,11 @@ def test_bodies_that_cannot_be_are_refused(bodies: int | list[MovingBody], word:
 @pytest.mark.parametrize("size", [None, 3, (1.0, 1.0), "big"])
 def test_what_is_no_box_or_figure_is_refused_at_once(size: Any) -> None:
     """It was a fault of Python's, about a subscript or an attribute."""
-    with pytest.raises(GavoError, match="box 'a': size: three edge lengths are needed"):
+    with pytest.raises(GavoError, match="box 'a': size: expected three edge lengths"):
         box("a", size, Sway(np.eye(4)))
     with pytest.raises(GavoError, match="box 'a': colour: not one of yaw, tint"):
         box("a", (1.0, 1.0, 1.0), Sway(np.eye(4)), colour=size)
-    with pytest.raises(GavoError, match="figure 'a': a Walk is needed"):
+    with pytest.raises(GavoError, match="figure 'a': expected a Walk"):
         figure("a", size)
     with pytest.raises(GavoError, match="figure 'a': tall"):
         figure("a", Walk((0.0, 0.0, 0.0), 0.0), 0.0)

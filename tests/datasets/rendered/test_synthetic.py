@@ -324,18 +324,18 @@ def test_any_camera():
     ("arguments", "word"),
     [
         ({"frames": 0}, "frames"),
-        ({"frames": 2.5}, "frames: a whole number is needed, not 2.5"),
-        ({"frames": "3"}, "frames: a whole number is needed, not '3'"),
+        ({"frames": 2.5}, "frames: expected a whole number, got 2.5"),
+        ({"frames": "3"}, "frames: expected a whole number, got '3'"),
         ({"frames": 10**9}, "frames: must be at most 1000000"),
         ({"seed": -1}, "seed"),
-        ({"seed": 1.5}, "seed: a whole number is needed"),
-        ({"seed": None}, "seed: a whole number is needed"),
+        ({"seed": 1.5}, "seed: expected a whole number"),
+        ({"seed": None}, "seed: expected a whole number"),
         ({"rate": 0.0}, "rate"),
-        ({"rate": "30"}, "rate: a number is needed, not '30'"),
+        ({"rate": "30"}, "rate: expected a number, got '30'"),
         ({"speed": float("inf")}, "speed"),
-        ({"speed": None}, "speed: a number is needed"),
+        ({"speed": None}, "speed: expected a number"),
         ({"noise": None}, "noise: expected a SensorNoise, got None"),
-        ({"camera": "fr1"}, "a Camera is needed, not str"),
+        ({"camera": "fr1"}, "expected a Camera, got str"),
         ({"trajectory": 1}, "trajectory: expected a Trajectory or a TUM file, got 1"),
         ({"trajectory": "nowhere/groundtruth.txt"}, "nowhere"),
         ({"trajectory": Trajectory(np.zeros(0), np.zeros((0, 4, 4)))}, "empty"),
@@ -426,5 +426,5 @@ def test_rendering_keeps_up():
 @pytest.mark.parametrize("scale", [1.0, 1e5, float("nan")])
 def test_a_unit_in_which_16_bits_hold_no_room_is_refused(scale: float) -> None:
     """Depth came in whole metres, or not at all."""
-    with pytest.raises(GavoError, match="depth_scale: (must be from 100 to 20000|a positive number is needed)"):
+    with pytest.raises(GavoError, match="depth_scale: (must be from 100 to 20000|expected a positive number)"):
         SyntheticSequence(2, camera=replace(DEFAULT_CAMERA, depth_scale=scale))
