@@ -136,8 +136,8 @@ def _inverse(sequence: FrameSequence) -> str | None:
     if straight < PLANES or opposite > MOST_OTHERS * straight:
         return None
     return (
-        f"{straight} patches are flat in these numbers, and {opposite} in their inverse, as planes are not: this "
-        "looks like disparity or inverse depth, as MiDaS estimates it: write depth"
+        f"{straight} patches are flat in these numbers, and {opposite} in their inverse; of depth, the inverse is flat "
+        "on planes: this looks like disparity or inverse depth, as MiDaS estimates it: write depth"
     )
 
 
