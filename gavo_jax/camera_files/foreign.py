@@ -1,4 +1,4 @@
-"""Camera files that are known and not read: what helps, by the names or the words that stand in them."""
+"""Camera files of known kinds that cannot be read: how to convert them, by the keys or words in them."""
 
 import re
 from pathlib import Path
@@ -32,7 +32,7 @@ BY_NAME: tuple[tuple[re.Pattern[str], str], ...] = (
         "length / aperture, and the middle of an image is cx = (width - 1) / 2",
     ),
 )
-"""Names of entries, and what a file with such an entry is, in the order in which they are tried."""
+"""Keys, and what a file with such a key is, in the order in which they are tried."""
 
 IN_TEXT: tuple[tuple[str, str], ...] = (
     (r"(?i)\bppx\b", "of RealSense: write width, height, fx, fy, ppx, ppy, model and coeffs into a .json"),
@@ -41,7 +41,7 @@ IN_TEXT: tuple[tuple[str, str], ...] = (
     (r"^\s*fx\s*=", "if its values have names, rename it to .toml"),
     (r"^\s*fx\s+[-+\d]", "if its values have names, put = behind each and rename it to .toml"),
 )
-"""Patterns in a text of numbers that are not read, and what helps."""
+"""Patterns in a text of numbers that cannot be read, and advice."""
 
 BY_ENDING = {
     ".npy": "write it as text: numpy.savetxt('camera.txt', numpy.load(FILE))",
@@ -52,14 +52,14 @@ BY_ENDING = {
     ".cfg": "rename it to .toml, or to .txt if it is a matrix or a row of numbers",
     ".bin": "COLMAP's: write it as cameras.txt (colmap model_converter --output_type TXT)",
 }
-"""What helps with files of other endings."""
+"""Advice for other suffixes."""
 
 DEEPEST = 3
-"""Levels of tables in which cameras are looked for."""
+"""Maximum depth of nested tables searched for cameras."""
 
 
 def refuse_foreign(path: Path, values: Table) -> None:
-    """Refuse a table of a known kind that is not read, or whose cameras lie within; otherwise do nothing.
+    """Refuse a table of a known kind that cannot be read, or whose cameras are in nested tables; otherwise do nothing.
 
     Raises:
         GavoError: the message says what would help.
@@ -75,7 +75,7 @@ def refuse_foreign(path: Path, values: Table) -> None:
 
 
 def _cameras_within(values: Table, above: str) -> list[str]:
-    """Places of the tables that hold a camera, as `color` or `Dataset.Calibration`."""
+    """Paths of the nested tables that contain a camera, such as `color` or `Dataset.Calibration`."""
     found = []
     for name, inner in values.items():
         if not isinstance(inner, dict):
@@ -88,19 +88,19 @@ def _cameras_within(values: Table, above: str) -> list[str]:
 
 
 def hint_of_text(text: str) -> str:
-    """What helps with a text of numbers that is not read, after a colon; empty where nothing is known."""
+    """Advice for a text of numbers that cannot be read, after a colon; empty if there is none."""
     words = next((words for pattern, words in IN_TEXT if re.search(pattern, text, re.MULTILINE)), "")
     return words and f": {words}"
 
 
 def hint_of_ending(path: Path) -> str:
-    """What helps with a file of another ending, after a colon; empty where nothing is known."""
+    """Advice for a file of another suffix, after a colon; empty if there is none."""
     words = BY_ENDING.get(path.suffix.lower(), "")
     return words and f": {words}"
 
 
 def refuse_bop_camera(path: Path, values: Table) -> None:
-    """Refuse the `camera.json` of a BOP dataset, which has our keys, and millimetres per unit in `depth_scale`.
+    """Refuse the `camera.json` of a BOP dataset: it has our keys, but its `depth_scale` is in millimetres per unit.
 
     Raises:
         GavoError: the message says what to write.

@@ -1,7 +1,7 @@
-"""Depth images that hold something else than depth: swapped bytes, stretched pictures, disparity, limits.
+"""Depth images that contain something other than depth: swapped bytes, stretched pictures, disparity, limits.
 
-Each is recognised by what only its own numbers do, whatever the scene. What `fault_of_depth` finds is refused before a
-run; `doubt_of_depth` is said by `gavo inspect` alone.
+Each is recognised by a property that true depth never has, whatever the scene. A run refuses what `fault_of_depth`
+finds; only `gavo inspect` reports what `doubt_of_depth` finds.
 """
 
 import itertools
@@ -16,46 +16,51 @@ from gavo_jax.datasets.depth_unit import doubt_of_scale, fault_of_scale, first_d
 from gavo_jax.datasets.images import without_invalid
 from gavo_jax.image.numbers import NO_READING
 
-FEWEST = 1000
-"""Fewest readings, or pairs of neighbouring ones, that are judged."""
+MIN_READINGS = 1000
+"""Minimum number of readings, or of pairs of neighbouring readings, for a judgement."""
 
 SWAPPED = 8.0
-"""Mean step between neighbours over that after the bytes are swapped, from which on they count as swapped. The steps of
-real depth are a hundred times smaller than those of its swapped numbers; those of noise are equal."""
+"""Ratio of the mean step between neighbours to that after swapping the bytes, above which they count as swapped. The
+steps of real depth are a hundred times smaller than those of its swapped numbers; those of noise are equal.
+"""
 
 STRETCHES, DISTINCT = (257, 256), 16
-"""Factors by which programs stretch 8 bits to 16, and the fewest different numbers that tell."""
+"""Factors by which programs stretch 8 bits to 16, and the minimum number of different values for a judgement."""
 
 RAW_KINECT = 2047
-"""What a Kinect's raw disparity, of 11 bits, has where there is no reading."""
+"""Value of a missing reading in a Kinect's raw disparity, which has 11 bits."""
 
 MUCH, GAP = 0.05, 0.95
-"""Share of the readings at the farthest one, and next farthest reading over it, from which on that is a limit."""
+"""The farthest reading is a limit if at least this share of the readings equals it, and the next one is nearer than
+this part of it.
+"""
 
 ROUND_LIMIT = 5.0
-"""Whole numbers of metres from here on are limits, too: no scene has much of itself just there."""
+"""Distance, metres, from which a whole number of metres is a limit, too: no scene has much at exactly that distance."""
 
 SAMPLED_FOR_PLANES = 9
 """Number of frames, spread over the sequence, in which flat surfaces are looked for."""
 
 PATCHES, FULL = (8, 5), 0.9
-"""Patches along an image's width (they overlap by half), and the share of readings that a patch needs."""
+"""Patches along an image's width (they overlap by half), and the minimum share of a patch that has readings."""
 
 WIDTH = 320
-"""Columns of an image that are enough for patches."""
+"""Width to which images are thinned out before patches are cut."""
 
 RECEDING = 1.15
-"""Farthest over nearest reading from which on a patch tells a plane's depth from its inverse."""
+"""Ratio of the farthest to the nearest reading above which a patch distinguishes a plane's depth from its inverse."""
 
 FLAT, FLATTER = 0.05, 1.5
-"""Largest deviation of a flat patch, as a share of its standard deviation, and how often it goes into the other's."""
+"""Maximum deviation from a plane, as a share of the patch's standard deviation, and the minimum ratio of the deviation
+of depth to that of its inverse, or the reverse.
+"""
 
 PLANES, MOST_OTHERS = 6, 0.1
-"""Fewest flat patches for a judgement, and the largest share of them that may say the opposite."""
+"""Minimum number of flat patches for a judgement, and the maximum share of them that may contradict it."""
 
 
 def fault_of_depth(sequence: FrameSequence) -> str | None:
-    """Describe why the depth of a sequence is no depth, or in the wrong unit; None if nothing tells.
+    """Describe why the depth of a sequence is not depth, or in the wrong unit; None if it may be right.
 
     Judged by its first frames, except those that cannot be read.
     """
@@ -67,7 +72,7 @@ def _fault_of_numbers(images: Sequence[UInt16[np.ndarray, "h w"]]) -> str | None
     readings = (
         np.concatenate([image[(image > 0) & (image < NO_READING)] for image in images]) if images else np.empty(0)
     )
-    if readings.size < FEWEST:
+    if readings.size < MIN_READINGS:
         return None
     values = np.unique(readings)
     for factor in STRETCHES:
@@ -95,7 +100,7 @@ def _mean_step(images: Sequence[UInt16[np.ndarray, "h w"]]) -> float:
         has_both = (np.minimum(left, right) > 0) & (np.maximum(left, right) < NO_READING)
         steps.append(np.abs(left - right)[has_both])
     found = np.concatenate(steps)
-    return float(found.mean()) if found.size >= FEWEST else 0.0
+    return float(found.mean()) if found.size >= MIN_READINGS else 0.0
 
 
 def doubt_of_depth(sequence: FrameSequence) -> str | None:
@@ -106,10 +111,10 @@ def doubt_of_depth(sequence: FrameSequence) -> str | None:
 
 
 def _limit(sequence: FrameSequence) -> str | None:
-    """Describe a limit that many readings have in place of none, as simulators and filters leave it."""
+    """Describe a maximum that stands for missing readings, as simulators leave it; None if there is none."""
     images = [without_invalid(image) for image in first_depths(sequence)]
     readings = np.concatenate([image[image > 0] for image in images]) if images else np.empty(0)
-    if readings.size < FEWEST:
+    if readings.size < MIN_READINGS:
         return None
     most, scale = float(readings.max()), unit_of_file(sequence)
     share, nearer = float(np.mean(readings == readings.max())), readings[readings < readings.max()]
@@ -119,13 +124,16 @@ def _limit(sequence: FrameSequence) -> str | None:
     if share < MUCH or not (is_round or nearer.max() < GAP * most):
         return None
     return (
-        f"{100 * share:.0f} % of the readings are {most / scale:.4g} m, the farthest: where that is a limit, or stands "
-        "for no reading, write 0"
+        f"{100 * share:.0f} % of the readings are {most / scale:.4g} m, the farthest: if that is a limit, or stands "
+        "for a missing reading, write 0"
     )
 
 
 def _inverse(sequence: FrameSequence) -> str | None:
-    """Describe numbers that grow with nearness, by flat surfaces: there, the inverse of depth is a plane, not depth."""
+    """Describe disparity or inverse depth, recognised by flat surfaces; None if it is not.
+
+    On a plane, the inverse of depth is a linear function of the pixel, and depth is not.
+    """
     read, straight, opposite = reader_of(sequence), 0, 0
     for at in sorted({round(place) for place in np.linspace(0, len(sequence) - 1, SAMPLED_FOR_PLANES)}):
         try:

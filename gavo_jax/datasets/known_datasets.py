@@ -1,4 +1,4 @@
-"""Datasets and recordings that are not read: what their folders are recognised by, and what makes a source of them."""
+"""Datasets and recordings that cannot be read: how to recognise their folders, and how to convert them."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -11,12 +11,12 @@ AS_DEPTH = "as z = length / sqrt(1 + x^2 + y^2)"
 
 
 class Known(NamedTuple):
-    """A kind of folder that is known, but not read."""
+    """A kind of folder that is recognised, but cannot be read."""
 
     patterns: tuple[str, ...]
-    """Glob patterns; the folder has something for each."""
+    """Glob patterns; the folder has a match for each."""
     words: str
-    """What it is, and what helps."""
+    """What it is, and how to convert it."""
 
 
 KNOWN = (
@@ -84,15 +84,15 @@ KNOWN = (
         "an RGB-D camera",
     ),
 )
-"""Known kinds of folders; the first whose patterns fit is told."""
+"""Known kinds of folders; the first whose patterns match counts."""
 
 
 def words_of_known(path: Path) -> str | None:
-    """What a folder is, and what helps, if it is of a known kind that is not read; else None."""
+    """Describe a folder of a known kind and how to convert it; None if it is of no such kind."""
     return next((known.words for known in KNOWN if all(_has(path, pattern) for pattern in known.patterns)), None)
 
 
 def _has(path: Path, pattern: str) -> bool:
-    """Whether a folder has something for a pattern: a folder if that ends with a slash."""
+    """Whether a folder contains a match for a pattern: a folder if the pattern ends with a slash."""
     found = path.glob(pattern.rstrip("/"))
     return any(there.is_dir() or not pattern.endswith("/") for there in found)
