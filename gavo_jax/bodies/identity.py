@@ -23,6 +23,8 @@ THICK = 6 / 160
 """Radius, over the image's width, of a disc that has to fit inside a new body."""
 MAX_BODIES = 8
 """Maximum number of bodies at a time; the largest ones are kept."""
+REACH = 2.0
+"""Distance up to which a part that overlaps no body can be one, over the square root of the smaller one's area."""
 MAX_UNSEEN = 15
 """Frames after which an unseen body is forgotten."""
 
@@ -121,17 +123,28 @@ def associate(found: Integer[np.ndarray, "h w"], tracks: BodyTracks) -> BodyTrac
 def _numbers(found: Integer[np.ndarray, "h w"], tracks: BodyTracks) -> Int32[np.ndarray, " parts"]:
     """The body number of each part of a mask, after a 0 for the background.
 
-    Parts are matched with known bodies one to one, the largest overlap first; the other parts get new numbers.
+    Parts are matched with known bodies one to one, the largest overlap first. A part that overlaps none is the nearest
+    body of the last frame within reach, as in a fast pan; the other parts get new numbers.
     """
     parts = range(1, int(found.max(initial=0)) + 1)
-    overlaps = sorted(
-        (-int(np.sum((found == part) & (tracks.labels == number))), part, int(number))
-        for part in parts
-        for number in tracks.numbers[tracks.numbers > 0]
-    )
+    is_recent = dict(zip(tracks.numbers.tolist(), (tracks.ages == 0).tolist(), strict=True))
+    matches = []
+    for part, number in itertools.product(parts, tracks.numbers[tracks.numbers > 0].tolist()):
+        here, there = found == part, tracks.labels == number
+        if not np.any(there):
+            continue
+        overlap, apart = int(np.sum(here & there)), _distance(here, there)
+        reach = REACH * np.sqrt(min(np.sum(here), np.sum(there)))
+        if overlap or (is_recent[number] and apart < reach):
+            matches.append((-overlap, apart, part, number))
     given: dict[int, int] = {}
-    for overlap, part, number in overlaps:
-        if overlap < 0 and part not in given and number not in given.values():
+    for _, _, part, number in sorted(matches):
+        if part not in given and number not in given.values():
             given[part] = number
     new = itertools.count(int(tracks.last) + 1)
     return np.array([0, *(given[part] if part in given else next(new) for part in parts)], np.int32)
+
+
+def _distance(one: Bool[np.ndarray, "h w"], other: Bool[np.ndarray, "h w"]) -> float:
+    """Distance between the centroids of two masks, pixels."""
+    return float(np.linalg.norm(np.argwhere(one).mean(axis=0) - np.argwhere(other).mean(axis=0)))

@@ -27,6 +27,17 @@ def test_the_largest_part_needs_less_where_depth_disagrees() -> None:
     assert not np.any(body_components(both, 0.05 * both, nowhere, depth_disagrees=True))
 
 
+def test_a_body_keeps_its_number_in_a_fast_pan() -> None:
+    """It no longer overlaps where it was."""
+    mask = np.zeros((60, 80), np.int32)
+    before, after, elsewhere = mask.copy(), mask.copy(), mask.copy()
+    before[20:40, 10:20] = after[20:40, 24:34] = elsewhere[20:40, 68:78] = 1
+    tracks = associate(before, BodyTracks.empty((60, 80)))
+    assert set(np.unique(associate(after, tracks).labels)) >= {0, 1}
+    assert associate(after, tracks).labels[30, 30] == 1 and associate(after, tracks).last == 1
+    assert associate(elsewhere, tracks).labels[30, 70] == 2
+
+
 def test_bodies_keep_their_numbers() -> None:
     nowhere = np.zeros((60, 80), bool)
     both = body_components(field(BOX, OTHER), field(BOX, OTHER), nowhere)
