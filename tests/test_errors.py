@@ -108,5 +108,5 @@ TAKERS = {
 @pytest.mark.parametrize("taker", TAKERS)
 def test_what_is_no_path_is_one_line(taker, wrong):
     """It was a TypeError of pathlib's."""
-    with pytest.raises(GavoError, match="expected the path of a file or folder, not "):
+    with pytest.raises(GavoError, match="expected the path of a file or folder, got "):
         TAKERS[taker](wrong)

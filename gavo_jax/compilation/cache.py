@@ -79,7 +79,7 @@ def enable_compilation_cache(folder: str | Path | None = None) -> None:
     is_named = folder is not None or bool(os.environ.get("GAVO_CACHE_DIR"))
     folder = cache_folder() if folder is None else as_path(folder)
     if folder is None and is_named:
-        _warn(f"{os.environ['GAVO_CACHE_DIR']}: there is no such home folder: nothing is kept")
+        _warn(f"{os.environ['GAVO_CACHE_DIR']}: there is no such home folder: no programs are kept")
     keeps_compiled = not os.environ.get("JAX_COMPILATION_CACHE_DIR")
     parts = ["", "traced", "jax", f"jax/{processor_digest()}"][: 4 if keeps_compiled else 2]
     if folder is None or not all(_is_private(folder / part, is_named) for part in parts):

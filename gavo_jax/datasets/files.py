@@ -299,7 +299,7 @@ def _instead(path: Path) -> str:
         return f"image is missing, but {other[:200]} is there: correct the list, or leave its frame out"
     else:
         there = "not a file" if os.path.exists(path) else "image is missing"
-    return f"{there}: restore it, or leave its frame out"
+    return f"{there}: restore it, or omit its frame"
 
 
 def resolve_folder(folder: Path) -> Path:

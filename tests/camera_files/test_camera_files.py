@@ -451,9 +451,9 @@ FAULTS = {
     "millimetres.toml": (TOML.replace("500", "3.6"), "fx: must be a number from 64 to 12800, not 3.6"),
     "names.txt": ("fx: 500\nfy: 510\n", "nor a row of fx fy cx cy: if its values have names, rename it to .yaml"),
     "toml.txt": (TOML, "nor a row of fx fy cx cy: if its values have names, rename it to .toml"),
-    "underscores.txt": ("5_00 510 319.5 239.5\n", "neither a matrix"),
-    "numbers.txt": ("1 2 3\n4 5 6\n", "neither a matrix"),
-    "text.txt": ("hello\n", "neither a matrix"),
+    "underscores.txt": ("5_00 510 319.5 239.5\n", "neither a 3x3"),
+    "numbers.txt": ("1 2 3\n4 5 6\n", "neither a 3x3"),
+    "text.txt": ("hello\n", "neither a 3x3"),
 }
 
 

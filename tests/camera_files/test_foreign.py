@@ -84,15 +84,15 @@ def test_a_unit_of_depth_in_metres_is_one_beside_single_numbers_too(tmp_path: Pa
 
 INTRINSICS = {"ppx": 319.5, "ppy": 239.5, **CAMERA}
 REFUSED = {
-    "bop.json": ({**CAMERA, "depth_scale": 0.1}, "depth_scale: 0.1: .*BOP's are millimetres per unit: write 10000"),
+    "bop.json": ({**CAMERA, "depth_scale": 0.1}, "depth_scale: 0.1: .*BOP's is in millimetres per unit: write 10000"),
     "depthai.json": ({"cameraData": [[0, {}]], "version": 7}, r"DepthAI's calibration.*getCameraIntrinsics\(socket"),
     "k4a.json": ({"CalibrationInformation": {"Cameras": []}}, "Azure Kinect's raw .* azure_kinect_mkv_reader"),
     "viewer.json": ({"device": {}, "parameters": {}, "schema version": 1}, "settings of RealSense's viewer.*enumerate"),
     "two.json": ({"color": INTRINSICS, "depth": INTRINSICS}, "a camera in color, depth: write that of colour alone"),
     "monogs.yaml": ({"Dataset": {"Calibration": CAMERA}}, r"a camera in Dataset\.Calibration: write that"),
-    "frame.json": ({"cameraPoseARFrame": [1], "intrinsics": [1]}, "what is said of a frame: leave --camera out"),
-    "scene_camera.json": ({"0": {"cam_K": [1]}}, "a camera for each frame: .*leave --camera out"),
-    "pose_intrinsic_imu.json": ({"frame_000000": {"intrinsic": MATRIX}}, "a camera for each frame"),
+    "frame.json": ({"cameraPoseARFrame": [1], "intrinsics": [1]}, "metadata of a frame: omit --camera"),
+    "scene_camera.json": ({"0": {"cam_K": [1]}}, "one camera per frame: .*omit --camera"),
+    "pose_intrinsic_imu.json": ({"frame_000000": {"intrinsic": MATRIX}}, "one camera per frame"),
     "habitat.json": ({"width": 640, "height": 480, "hfov": 90}, r"an angle of view .* width / \(2 tan\(angle / 2\)\)"),
     "isaac.json": ({"cameraFocalLength": 18, "cameraAperture": [20, 15]}, "width [*] focal length / aperture"),
     "transforms.json": ({"camera_angle_x": 0.7, "frames": []}, r"write fl_x = w / \(2 tan\(camera_angle_x / 2\)\)"),
@@ -100,7 +100,7 @@ REFUSED = {
     "kitti.txt": ("P0: 7e2 0 6e2 0 0 7e2 1e2 0 0 0 1 0\n", "of KITTI: write the first, sixth, third"),
     "freenect.txt": ("fx 500\nfy 510\n", "if its values have names, put = behind each and rename it to .toml"),
     "K.npy": ("x", r"K\.npy: a camera file ends in .* or \.pincam: write it as text: numpy\.savetxt"),
-    "SN1234.conf": ("[LEFT_CAM_HD]\nfx=700\n", r"a ZED's is for images that are not rectified"),
+    "SN1234.conf": ("[LEFT_CAM_HD]\nfx=700\n", r"a ZED's applies to unrectified images"),
     "camera.odd": ("x", r"camera\.odd: a camera file ends in \.toml, .* or \.pincam$"),
 }
 

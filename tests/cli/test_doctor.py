@@ -87,7 +87,7 @@ def test_doctor_tells_a_compiler_that_is_ruled_out(gavo, monkeypatch):
     assert done.out.endswith("problems found: the version of JAX\n")
 
 
-@pytest.mark.filterwarnings("ignore:.*nothing is kept:gavo_jax.GavoWarning")
+@pytest.mark.filterwarnings("ignore:.*no programs are kept:gavo_jax.GavoWarning")
 def test_doctor_tells_a_cache_that_keeps_nothing(gavo, tmp_path, monkeypatch):
     file = tmp_path / "file"
     file.touch()

@@ -79,7 +79,7 @@ def test_where_others_can_write_nothing_is_kept_and_one_warning_says_so(tmp_path
     before = jax.config.values["jax_compilation_cache_dir"]
     with pytest.warns(GavoWarning) as said:
         enable_compilation_cache(folder)
-    assert len(said) == 1 and str(folder) in str(said[0].message) and "nothing is kept" in str(said[0].message)
+    assert len(said) == 1 and str(folder) in str(said[0].message) and "so none is kept" in str(said[0].message)
     assert programs._folder is None and jax.config.values["jax_compilation_cache_dir"] == before
 
 
@@ -131,12 +131,12 @@ def test_only_a_folder_that_was_asked_for_is_missed(tmp_path, monkeypatch, named
         assert not said
     else:
         assert len(said) == 1 and said[0].category is GavoWarning
-        assert str(said[0].message).startswith(f"{folder}: cannot be used (Not a directory): nothing is kept")
+        assert str(said[0].message).startswith(f"{folder}: cannot be used (Not a directory): no programs are kept")
 
 
 def test_a_home_that_is_not_there_is_missed(monkeypatch):
     monkeypatch.setenv("GAVO_CACHE_DIR", "~nobody-of-this-name/kept")
-    with pytest.warns(GavoWarning, match="no such home folder: nothing is kept"):
+    with pytest.warns(GavoWarning, match="no such home folder: no programs are kept"):
         enable_compilation_cache()
 
 

@@ -32,10 +32,16 @@ def disparity(millimetres: np.ndarray) -> np.ndarray:
 
 
 FAULTS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
-    "bytes": (lambda depth: depth.byteswap(), r"in the wrong order of bytes: swap them"),
-    "a picture times 257": (lambda depth: (depth // 40 * 257).astype(np.uint16), "multiple of 257: 8 bits stretched"),
-    "a picture times 256": (lambda depth: (depth // 40 * 256).astype(np.uint16), "multiple of 256: 8 bits stretched"),
-    "raw disparity": (disparity, "2047 in place of no reading: the raw disparity of a Kinect"),
+    "bytes": (lambda depth: depth.byteswap(), r"in the wrong byte order: swap them"),
+    "a picture times 257": (
+        lambda depth: (depth // 40 * 257).astype(np.uint16),
+        "multiple of 257: an 8-bit picture of depth, stretched",
+    ),
+    "a picture times 256": (
+        lambda depth: (depth // 40 * 256).astype(np.uint16),
+        "multiple of 256: an 8-bit picture of depth, stretched",
+    ),
+    "raw disparity": (disparity, "2047 for missing readings: the raw disparity of a Kinect"),
 }
 
 
@@ -63,7 +69,7 @@ def test_integers_that_are_a_far_scene_in_a_guessed_unit_are_refused(tmp_path: P
 
 @pytest.mark.parametrize("ending", [".png", ".npy"])
 @pytest.mark.parametrize(
-    ("limit", "words"), [(10.0, "of the readings are 10 m, the farthest: where that is a limit"), (3.0, None)]
+    ("limit", "words"), [(10.0, "of the readings are 10 m, the farthest: if that is a limit"), (3.0, None)]
 )
 def test_a_limit_in_place_of_no_reading_is_told(tmp_path: Path, ending: str, limit: float, words: str | None) -> None:
     """A wall at three metres is none."""
@@ -98,7 +104,7 @@ def test_numbers_that_grow_with_nearness_are_told_by_flat_surfaces(tmp_path: Pat
     depths = [slanted(1 + 0.05 * i) for i in range(len(METRES))]
     as_stored = [np.round(INVERSES.get(name, lambda depth: depth)(depth)).astype(np.uint16) for depth in depths]
     doubt = doubt_of_depth(open_source(source(tmp_path, as_stored)))
-    assert (doubt is not None and "disparity or inverse depth, it seems" in doubt) == (name != "depth")
+    assert (doubt is not None and "this looks like disparity or inverse depth" in doubt) == (name != "depth")
 
 
 @pytest.mark.parametrize("clip", CLIPS)

@@ -42,10 +42,10 @@ def test_depth_in_other_channels_is_refused(tmp_path: Path, depth: np.ndarray, f
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d\nsize 9\n", r"a pointer of Git LFS.*git lfs pull"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d\nsize 9\n", r"a Git LFS pointer.*git lfs pull"),
         (b"<!DOCTYPE html><html>", "a web page instead of an image: download or copy the file again"),
         (b"\n<html><body>404", "a web page instead of an image: download or copy the file again"),
-        (b"something", r"no image that OpenCV decodes \(begins with b'somethin'\)"),
+        (b"something", r"not an image that OpenCV can decode \(begins with b'somethin'\)"),
     ],
 )
 def test_what_lies_in_place_of_an_image_is_said(tmp_path: Path, content: bytes, words: str) -> None:

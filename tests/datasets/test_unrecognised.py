@@ -65,8 +65,8 @@ def made(folder: Path, *names: str) -> Path:
         ),
         (("d-1.pgm", "r-1.ppm"), "a raw recording of NYU Depth"),
         (("rgb/",), "a folder of rgb/, and "),
-        (("images/scene_cam_00_geometry_hdf5/frame.0000.depth_meters.hdf5",), "Hypersim, in HDF5: .* lengths of rays"),
-        (("scene_cam_00_final_hdf5/x.hdf5", "scene_cam_00_geometry_hdf5/x.hdf5"), "Hypersim, in HDF5"),
+        (("images/scene_cam_00_geometry_hdf5/frame.0000.depth_meters.hdf5",), "Hypersim scene in HDF5: .* ray lengths"),
+        (("scene_cam_00_final_hdf5/x.hdf5", "scene_cam_00_geometry_hdf5/x.hdf5"), "Hypersim scene in HDF5"),
         (
             ("image_02/data/0.png", "proj_depth/groundtruth/image_02/0.png"),
             "KITTI's depth completion: link image_02/data as rgb/ .* depth_scale = 256",
@@ -74,20 +74,26 @@ def made(folder: Path, *names: str) -> Path:
         (("image/0.png", "groundtruth_depth/0.png", "velodyne_raw/0.png"), "single images of KITTI's depth completion"),
         (
             tuple(f"{a}_{b}_images/0.png" for a in ("matterport", "undistorted") for b in ("color", "depth")),
-            "photographs of Matterport3D, which turns by 60 degrees",
+            "photographs of Matterport3D, 60 degrees apart",
         ),
-        (("PV/1.bytes", "Depth Long Throw/1.pgm", "Depth Long Throw_lut.bin"), "HoloLens 2: .*pinhole_projection"),
-        (("PV.tar", "Depth AHaT.tar"), "HoloLens 2: .*pinhole_projection"),
-        (("data/color0.jpg", "data/depth0.dpt"), "LINEMOD as first published: take it as BOP has it"),
-        (("images/0.jpg", "stereo/depth_maps/0.jpg.geometric.bin"), "depth of COLMAP's stereo, whose unit is unknown"),
-        (("1.jpg", "1.png", "2.jpg", "2.png", "a.txt"), r"1\.jpg beside 1\.png: put what is depth into depth/, and"),
-        (("frame1.jpg", "frame1.npy"), r"frame1\.jpg beside frame1\.npy: put what is depth into depth/"),
+        (
+            ("PV/1.bytes", "Depth Long Throw/1.pgm", "Depth Long Throw_lut.bin"),
+            "HoloLens 2 recording: .*pinhole_projection",
+        ),
+        (("PV.tar", "Depth AHaT.tar"), "HoloLens 2 recording: .*pinhole_projection"),
+        (("data/color0.jpg", "data/depth0.dpt"), "LINEMOD as first published: use its BOP version"),
+        (
+            ("images/0.jpg", "stereo/depth_maps/0.jpg.geometric.bin"),
+            "depth maps of COLMAP's stereo, whose unit is unknown",
+        ),
+        (("1.jpg", "1.png", "2.jpg", "2.png", "a.txt"), r"1\.jpg beside 1\.png: put depth into depth/, and"),
+        (("frame1.jpg", "frame1.npy"), r"frame1\.jpg beside frame1\.npy: put depth into depth/"),
         (("rgb/walk.mp4", "depth/0.png"), r"no colour images in rgb \(walk\.mp4\): a film goes .*, as rgb\.mp4"),
         (
             ("rgb/0.png", "depth/0.jpg"),
-            r"no depth images in depth \(0\.jpg\): those are pictures of depth: write",
+            r"no depth images in depth \(0\.jpg\): these are pictures of depth: write",
         ),
-        (("rgb/0.png", "depth/0.bin"), r"no depth images in depth \(0\.bin\): those end in \.png, "),
+        (("rgb/0.png", "depth/0.bin"), r"no depth images in depth \(0\.bin\): expected names ending in \.png, "),
         (("notes.md", "more.md"), "a folder of more.md, notes.md: not one of: "),
         (("a/", "b.md"), "colour is looked for in "),
         (tuple(f"{k}.md" for k in range(9)), r"a folder of 0\.md, 1\.md, 2\.md, 3\.md, 4\.md and 4 more"),
@@ -140,7 +146,7 @@ def test_a_source_further_down_is_named(tmp_path: Path) -> None:
 def test_a_source_four_folders_down_is_named(tmp_path: Path) -> None:
     """As BlenderProc writes its scenes."""
     folder = made(tmp_path / "output", *(f"bop_data/set/train_pbr/000000/{kind}/0.png" for kind in ("rgb", "depth")))
-    with pytest.raises(GavoError, match="one lies further down: name bop_data/set/train_pbr/000000$"):
+    with pytest.raises(GavoError, match="contains one: pass bop_data/set/train_pbr/000000$"):
         open_source(folder)
 
 

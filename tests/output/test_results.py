@@ -192,7 +192,7 @@ def test_a_finished_run_is_whole(tmp_path: Path, name: str) -> None:
     lines = (folder / name).read_text().splitlines()
     (folder / name).write_text("\n".join(lines[:-1]) + "\n")
     with pytest.raises(
-        GavoError, match="2 pairs in trajectory.txt and frames.csv, and 3 in metrics.json: files cut off"
+        GavoError, match="2 pairs in trajectory.txt and frames.csv, and 3 in metrics.json: files are cut off"
     ):
         read_run(folder)
 

@@ -24,7 +24,7 @@ def tum(folder: Path, scale: float, listed: str = "{kind}/{i}.png", ending: str 
 def test_the_unit_of_tums_layout_is_doubted_where_another_is_usual(tmp_path: Path) -> None:
     """Recorders write that layout in millimetres; unless a Kinect's, they were taken for fifths of one."""
     folder = tum(tmp_path, 1000 / np.median(METRES))
-    with pytest.raises(GavoError, match=r"5000 to a metre, a guess, has a median of 0\.2.*--depth-scale 1000\) it is"):
+    with pytest.raises(GavoError, match=r"5000 per metre, a guess, has a median of 0\.2.*--depth-scale 1000\) it is"):
         open_part(str(folder))
     (folder / "camera.toml").write_text(CAMERA_TOML + "depth_scale = 5000\n")
     assert open_part(str(folder)).camera.depth_scale == 5000
@@ -43,9 +43,7 @@ def test_an_image_of_another_ending_is_named(tmp_path: Path, listed: str, ending
 def test_images_in_folders_of_their_own_are_told(tmp_path: Path) -> None:
     image(tmp_path / "rgb/cam0/0.png", GREYS[0])
     image(tmp_path / "depth/cam0/0.png", raw(METRES[0], 1000))
-    with pytest.raises(
-        GavoError, match=r"no colour images in rgb \(cam0\): where they lie in cam0/, link that as rgb/"
-    ):
+    with pytest.raises(GavoError, match=r"no colour images in rgb \(cam0\): if they are in cam0/, link it as rgb/"):
         open_source(tmp_path)
 
 
