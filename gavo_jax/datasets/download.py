@@ -158,24 +158,27 @@ def _fetch(url: str, partial: Path, progress: Progress) -> None:
     with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT) as response:
         if response.status_code == requests.codes.requested_range_not_satisfiable:
             partial.unlink()
-            raise requests.ConnectionError("the partial file does not match the server's file")
+            raise requests.RequestException("the partial file does not match the server's file")
         response.raise_for_status()
         span = re.fullmatch(rf"bytes ({SIZE})-{SIZE}/({SIZE}|\*)", response.headers.get("Content-Range", ""))
         goes_on = response.status_code == requests.codes.partial_content and span is not None
         if goes_on and span is not None and int(span[1]) != have:
             partial.unlink(missing_ok=True)
-            raise requests.ConnectionError("the server resumed at the wrong position")
+            raise requests.RequestException("the server resumed at the wrong position")
         if not goes_on:
             have = 0
         length = response.headers.get("Content-Length", "")
         total = have + int(length) if re.fullmatch(SIZE, length) else None
         with partial.open("ab" if goes_on else "wb") as file:
-            for chunk in response.iter_content(CHUNK):
-                file.write(chunk)
-                have += len(chunk)
-                progress(have, total)
+            try:
+                for chunk in response.iter_content(CHUNK):
+                    file.write(chunk)
+                    have += len(chunk)
+                    progress(have, total)
+            except requests.ConnectionError:  # it stalled
+                raise requests.RequestException(f"no data for {TIMEOUT[1]:g} s") from None
     if total is not None and have != total:
-        raise requests.ConnectionError(f"received {have} of {total} bytes")
+        raise requests.RequestException(f"received {have} of {total} bytes")
 
 
 def _unpack(archive: Path, target: Path) -> None:
