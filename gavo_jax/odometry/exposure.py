@@ -17,6 +17,10 @@ explain the ratio, and the search estimates the gain itself.
 
 SHARPNESS_LEVEL = 1
 """Level of the pyramid on which sharpness is measured: on the finest one noise would count too."""
+MAX_STEEPNESS = 0.75
+"""Largest steepness, over the variance: of fine texture, a shift of less than a pixel makes all of E that there can be,
+twice the variance.
+"""
 
 
 class Exposure(NamedTuple):
@@ -27,7 +31,9 @@ class Exposure(NamedTuple):
     spread: Float[Array, ""]
     """Standard deviation, grey levels."""
     sharpness: Float[Array, ""]
-    """Squared difference of neighbouring pixels, averaged and added over both directions, over the squared contrast."""
+    """Steepness over the squared contrast: the squared difference of neighbouring pixels, averaged and added over both
+    directions, and at most `MAX_STEEPNESS` of the variance.
+    """
 
     @classmethod
     def of(cls, pyramid: Pyramid) -> "Exposure":
@@ -35,7 +41,7 @@ class Exposure(NamedTuple):
         coarse, fine = pyramid[-1].grey, pyramid[SHARPNESS_LEVEL].grey
         spread = jnp.maximum(jnp.std(coarse), 0.1)
         steepness = sum(jnp.mean(jnp.diff(fine, axis=axis) ** 2) for axis in (0, 1))
-        return cls(jnp.mean(coarse), spread, steepness / spread**2)
+        return cls(jnp.mean(coarse), spread, jnp.minimum(steepness, MAX_STEEPNESS * jnp.var(fine)) / spread**2)
 
     def error_per_pixel(self, before: "Exposure") -> Float[Array, ""]:
         """About the photometric error E after a shift of one pixel of level `SHARPNESS_LEVEL`, squared grey levels.
@@ -46,7 +52,8 @@ class Exposure(NamedTuple):
         Args:
             before: Exposure of the reference.
         """
-        return self.spread**2 * jnp.maximum(self.sharpness, before.sharpness)
+        found = self.spread**2 * jnp.maximum(self.sharpness, before.sharpness)
+        return jnp.maximum(found, 0.01)  # images without any texture
 
 
 SLOW_GAIN, SLOW_SHIFT = 1.35, 40.0

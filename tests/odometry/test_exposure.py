@@ -7,6 +7,7 @@ import pytest
 
 from gavo_jax.image.pyramid import LEVELS, build_pyramid
 from gavo_jax.odometry.exposure import SHARPNESS_LEVEL, Exposure
+from gavo_jax.odometry.plausibility import MAX_ERROR_RATIO, MIN_USUAL_ERROR
 
 
 def exposure_of(grey: np.ndarray) -> Exposure:
@@ -26,6 +27,13 @@ def test_error_per_pixel_is_that_of_a_shift(image: np.ndarray) -> None:
     shifted = [np.mean((np.roll(image, step, axis)[step:, step:] - image[step:, step:]) ** 2) for axis in (0, 1)]
     exposure = exposure_of(image)
     assert float(exposure.error_per_pixel(exposure)) == pytest.approx(sum(shifted), rel=0.1)
+
+
+def test_fine_texture_cannot_hide_that_images_differ() -> None:
+    """Their E, twice the variance, has to exceed what is a high error after a camera at rest."""
+    one, other = np.random.default_rng(0).normal(120.0, 20.0, (2, 64, 80)).repeat(2, axis=1).repeat(2, axis=2)
+    exposure = exposure_of(one)
+    assert np.mean((one - other) ** 2) > 1.5 * MAX_ERROR_RATIO * MIN_USUAL_ERROR * exposure.error_per_pixel(exposure)
 
 
 def test_the_sharper_image_counts(image: np.ndarray) -> None:
