@@ -46,10 +46,14 @@ def grey(make: Grey) -> Condition:
     """Change all grey images."""
 
     def alter(_: FrameSequence, index: int, frame: Frame) -> Frame:
-        levels = make(index, frame.grey.astype(np.float32))
-        return replace(frame, grey=np.clip(np.round(levels), 0, 255).astype(np.uint8))
+        return replace(frame, grey=rounded(make(index, frame.grey.astype(np.float32))))
 
     return every_frame(alter)
+
+
+def rounded(levels: Image) -> Image:
+    """Grey levels as an image of 8 bits."""
+    return np.clip(np.round(levels), 0, 255).astype(np.uint8)
 
 
 def depth(make: Callable[[int, Image], Image]) -> Condition:
@@ -76,8 +80,7 @@ def noisy(seed: int, clip: FrameSequence, index: int, frame: Frame) -> Frame:
     generator = random(seed)
     levels = frame.grey + generator.normal(0.0, 1.2, frame.grey.shape)
     raw = np.where(frame.depth > 0, frame.depth + generator.integers(-8, 9, frame.depth.shape), 0)
-    grey = np.clip(np.round(levels), 0, 255).astype(np.uint8)
-    return replace(frame, grey=grey, depth=raw.astype(frame.depth.dtype))
+    return replace(frame, grey=rounded(levels), depth=raw.astype(frame.depth.dtype))
 
 
 def gain(of_place: Callable[[int, Image, Image], Image]) -> Condition:

@@ -133,10 +133,12 @@ def _numbers(found: Integer[np.ndarray, "h w"], tracks: BodyTracks) -> Int32[np.
         here, there = found == part, tracks.labels == number
         if not np.any(there):
             continue
-        overlap, apart = int(np.sum(here & there)), _distance(here, there)
-        reach = REACH * np.sqrt(min(np.sum(here), np.sum(there)))
-        if overlap or (is_recent[number] and apart < reach):
-            matches.append((-overlap, apart, part, number))
+        if overlap := int(np.sum(here & there)):
+            matches.append((-overlap, 0.0, part, number))
+        elif is_recent[number]:
+            apart = _distance(here, there)
+            if apart < REACH * np.sqrt(min(np.sum(here), np.sum(there))):
+                matches.append((0, apart, part, number))
     given: dict[int, int] = {}
     for _, _, part, number in sorted(matches):
         if part not in given and number not in given.values():

@@ -64,8 +64,13 @@ def fault_of_depth(sequence: FrameSequence) -> str | None:
 
     Judged by its first frames, except those that cannot be read.
     """
-    images = [image for image in first_depths(sequence) if image.dtype == np.uint16]
-    return _fault_of_numbers(images) or fault_of_scale(sequence)
+    return _fault(sequence, first_depths(sequence))
+
+
+def _fault(sequence: FrameSequence, depths: list[np.ndarray]) -> str | None:
+    return _fault_of_numbers([image for image in depths if image.dtype == np.uint16]) or fault_of_scale(
+        sequence, depths
+    )
 
 
 def _fault_of_numbers(images: Sequence[UInt16[np.ndarray, "h w"]]) -> str | None:
@@ -105,18 +110,19 @@ def _mean_step(images: Sequence[UInt16[np.ndarray, "h w"]]) -> float:
 
 def doubt_of_depth(sequence: FrameSequence) -> str | None:
     """Describe what is unusual in the depth of a sequence, besides a `fault_of_depth`; None if nothing is."""
-    of_scale = None if fault_of_depth(sequence) else doubt_of_scale(sequence)
-    doubts = (of_scale, _limit(sequence), _inverse(sequence))
+    depths = first_depths(sequence)
+    of_scale = None if _fault(sequence, depths) else doubt_of_scale(sequence, depths)
+    doubts = (of_scale, _limit(depths, unit_of_file(sequence)), _inverse(sequence))
     return "; ".join(filter(None, doubts)) or None
 
 
-def _limit(sequence: FrameSequence) -> str | None:
+def _limit(depths: list[np.ndarray], scale: float) -> str | None:
     """Describe a maximum that stands for missing readings, as simulators leave it; None if there is none."""
-    images = [without_invalid(image) for image in first_depths(sequence)]
+    images = [without_invalid(image) for image in depths]
     readings = np.concatenate([image[image > 0] for image in images]) if images else np.empty(0)
     if readings.size < MIN_READINGS:
         return None
-    most, scale = float(readings.max()), unit_of_file(sequence)
+    most = float(readings.max())
     share, nearer = float(np.mean(readings == readings.max())), readings[readings < readings.max()]
     if not nearer.size:
         return f"every reading is {most / scale:.4g} m"

@@ -138,12 +138,16 @@ def _most_usual(sample: DepthSample, units: list[float]) -> float | None:
     return min(likely, key=lambda unit: abs(np.log(sample.median / unit / USUAL_MEDIAN)), default=None)
 
 
-def fault_of_scale(sequence: FrameSequence) -> str | None:
+def fault_of_scale(sequence: FrameSequence, depths: list[np.ndarray] | None = None) -> str | None:
     """Describe a probably wrong depth scale of a sequence and what to set instead; None if it looks right.
 
     Judged by its first frames, except those that cannot be read.
+
+    Args:
+        sequence: The sequence.
+        depths: Its `first_depths`; None to read them.
     """
-    sample, scale = sample_sequence(sequence)
+    sample, scale = sample_sequence(sequence, depths)
     calibration = getattr(sequence, "calibration", None)
     is_kinect = getattr(calibration, "preset", None) in KINECTS
     better = None if sample is None else better_scale(sample, scale, sequence.camera, is_kinect)
@@ -174,9 +178,14 @@ def _in_another_unit(sample: DepthSample, scale: float) -> str:
     return f"; in {named} it is {sample.median / other:.3g} m"
 
 
-def doubt_of_scale(sequence: FrameSequence) -> str | None:
-    """Describe a median depth that is unusual, and what it is in another unit; None where it is usual."""
-    sample, scale = sample_sequence(sequence)
+def doubt_of_scale(sequence: FrameSequence, depths: list[np.ndarray] | None = None) -> str | None:
+    """Describe a median depth that is unusual, and what it is in another unit; None where it is usual.
+
+    Args:
+        sequence: The sequence.
+        depths: Its `first_depths`; None to read them.
+    """
+    sample, scale = sample_sequence(sequence, depths)
     if sample is None or DEPTH_RANGE[0] < sample.median / scale < DEPTH_RANGE[1]:
         return None
     in_other, as_bits = _in_another_unit(sample, scale), _as_halves(sample) or _as_shares(sample, scale)
@@ -246,9 +255,11 @@ def unit_of_file(sequence: FrameSequence) -> float:
     return sequence.camera.depth_scale if unit is None else unit.file
 
 
-def sample_sequence(sequence: FrameSequence) -> tuple[DepthSample | None, float]:
-    """Statistics of the first frames' depth, as stored where the sequence gives that, and its units per metre."""
-    return sample_depth(first_depths(sequence)), unit_of_file(sequence)
+def sample_sequence(
+    sequence: FrameSequence, depths: list[np.ndarray] | None = None
+) -> tuple[DepthSample | None, float]:
+    """Statistics of the first frames' depth (`depths`, or as read here), and its units per metre."""
+    return sample_depth(first_depths(sequence) if depths is None else depths), unit_of_file(sequence)
 
 
 NAMES = {
