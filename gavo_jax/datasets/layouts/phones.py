@@ -115,13 +115,13 @@ class Record3D(PlainFolder):
         return file.is_file() and "K" in told_in(file) and super().recognises(path)
 
     @classmethod
-    def clock(cls, path: Path) -> Seconds | None:
+    def clock(cls, path: Path, color: list[Path], depth: list[Path]) -> tuple[Seconds | None, list[str]]:
         """Times of the frames from `frameTimestamps`, else from `fps`."""
         told = told_in(path / cls.FILE)
         stamps = told.get("frameTimestamps")
         if isinstance(stamps, list) and len(stamps) > 1:
-            return _clock_of(f"{path / cls.FILE}: frameTimestamps", stamps)
-        return by_rate(told.get("fps"))
+            return _clock_of(f"{path / cls.FILE}: frameTimestamps", stamps), []
+        return by_rate(told.get("fps")), []
 
 
 def _clock_of(place: str, stamps: list[Any]) -> Seconds:

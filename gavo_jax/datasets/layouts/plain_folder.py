@@ -10,6 +10,7 @@ from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import Entry, FileSequence, Reading, depth_size_of_most, resolve_folder, size_of_most
 from gavo_jax.datasets.films import film_of, rate_of
 from gavo_jax.datasets.layouts.image_folders import passed_over, plain_files
+from gavo_jax.datasets.layouts.listed_times import listed_times
 from gavo_jax.datasets.layouts.nerf import TRANSFORMS, read_transforms
 from gavo_jax.datasets.layouts.numbered import NUMBERS, RATE
 from gavo_jax.datasets.layouts.pairing import Paired, paired_by_number, paired_by_stamp
@@ -24,15 +25,11 @@ BY_FILM = "as the film says"
 """Value of `times_guessed` for stamps from frame numbers at a film's rate."""
 
 
-TIMES = ("timestamps.txt", "timestamp.txt", "times.txt", "timestamps.csv")
-"""Names under which programs list the times of frames."""
-
-
 class PlainFolder(FileSequence):
     """A folder of colour and a folder of depth images, or one folder of both, distinguished by name.
 
-    Names that are stamps are paired by time (see `names.stamps`). Otherwise images of the same number form a frame, and
-    its time is that number over the rate.
+    Names that are stamps are paired by time (see `names.stamps`). Otherwise images of the same number form a frame. Its
+    time is the one that a list states (see `listed_times`), else that number over the rate.
     """
 
     kind: ClassVar[str] = "folder of colour and depth images"
@@ -69,7 +66,7 @@ class PlainFolder(FileSequence):
         root = resolve_folder(path)
         color, depth, others = cls.images(path)
         film = film_of(color[0]) if color else None
-        told = None if reading.rate else cls.clock(path)
+        told, unread_times = (None, []) if reading.rate else cls.clock(path, color, depth)
         usual = reading.rate or (film and rate_of(film)) or RATE
         paired = cls.pair(path, color, depth, reading, told or (lambda numbers: numbers / usual))
         own = partial(cls.calibrate, path, paired.entries, reading)
@@ -78,7 +75,7 @@ class PlainFolder(FileSequence):
             calibration = calibration.with_depth_of_size(*depth_size_of_most(paired.entries))
         truth, unread = cls.truth(path, paired)
         is_open = paired.seconds is not None and not reading.rate and told is None
-        unread += unread_truth(path, truth, cls.ESTIMATES) + (_unread_times(path) if is_open else [])
+        unread += unread_truth(path, truth, cls.ESTIMATES) + (unread_times if is_open else [])
         sequence = cls(root.name, paired.entries, calibration, truth, reading, paired.left_out + others + unread)
         counted = NUMBERS if film is None else BY_FILM
         sequence.times_guessed = counted if is_open else paired.guessed
@@ -103,9 +100,9 @@ class PlainFolder(FileSequence):
         return paired_by_stamp(path, color, depth, reading) or paired_by_number(path, color, depth, seconds)
 
     @classmethod
-    def clock(cls, path: Path) -> Seconds | None:
-        """Mapping from frame numbers to times from a file in the folder; None if there is none."""
-        return None
+    def clock(cls, path: Path, color: list[Path], depth: list[Path]) -> tuple[Seconds | None, list[str]]:
+        """Mapping from frame numbers to times from a file in the folder; see `listed_times`."""
+        return listed_times(path, color, depth)
 
     @classmethod
     def truth(cls, path: Path, paired: Paired) -> tuple[Trajectory | None, list[str]]:
@@ -138,25 +135,17 @@ class Open3DFolder(PlainFolder):
         return load_calibration(file, partial(size_of_most, entries), MILLIMETRES)
 
     @classmethod
-    def clock(cls, path: Path) -> Seconds | None:
-        """Times at the rate that Open3D's RealSense reader writes into the intrinsics file."""
+    def clock(cls, path: Path, color: list[Path], depth: list[Path]) -> tuple[Seconds | None, list[str]]:
+        """Times from a list, else at the rate that Open3D's RealSense reader writes into the intrinsics file."""
         file = cls._intrinsics(path)
         assert file is not None
-        return by_rate(told_in(file).get("fps"))
+        listed, unread = super().clock(path, color, depth)
+        return listed or by_rate(told_in(file).get("fps")), unread
 
     @classmethod
     def _intrinsics(cls, path: Path) -> Path | None:
         names = ("camera_intrinsic.json", "camera_intrinsics.json", "intrinsic.json")
         return next((path / name for name in names if (path / name).is_file()), None)
-
-
-def _unread_times(path: Path) -> list[str]:
-    """List files of the frames' times, one line each; they are not read, as their units and order are open."""
-    return [
-        f"{name}: times are not read from it: name the images by them, or pass --rate"
-        for name in TIMES
-        if (path / name).is_file()
-    ]
 
 
 def by_rate(rate: Any) -> Seconds | None:

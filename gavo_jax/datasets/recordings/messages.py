@@ -50,6 +50,9 @@ LAYOUTS: dict[str, tuple[str, int, int | None]] = {
 }
 """Number type, channels and conversion to BGR of each encoding (None: it is BGR already, or depth)."""
 
+SPELLINGS = {name.lower(): name for name in LAYOUTS} | {"y8": "mono8", "yuy2": "yuyv"}
+"""The encodings by other spellings that drivers use, in lower case."""
+
 HALVED = ("nv12", "nv21")
 """Encodings whose rows of luma are followed by half as many rows of chroma, subsampled by two."""
 
@@ -70,8 +73,12 @@ INFRARED = re.compile(r"(?:^|[/_])(?:ir|infra|infrared|amplitude|intensity|dispa
 
 
 def encoding_of(kind: str, message: Any) -> str:
-    """The encoding of an image message, or the format of a compressed one."""
-    return message.encoding if kind == IMAGE else message.format
+    """The encoding of an image message, as `LAYOUTS` spells it, or the format of a compressed one."""
+    return _spelled(message.encoding) if kind == IMAGE else message.format
+
+
+def _spelled(encoding: str) -> str:
+    return SPELLINGS.get(encoding.lower(), encoding)
 
 
 def is_depth(kind: str, message: Any, topic: str) -> bool:
@@ -102,7 +109,7 @@ def color_of(kind: str, message: Any, name: str) -> np.ndarray:
     pixels = _pixels(message, name)
     if pixels.dtype.kind == "f":
         raise FrameError(f"{name}: encoding {message.encoding} is not colour")
-    return _converted(pixels, message.encoding, name)
+    return _converted(pixels, _spelled(message.encoding), name)
 
 
 def _mosaic(form: str) -> str | None:
@@ -129,7 +136,7 @@ def depth_of(kind: str, message: Any, name: str) -> np.ndarray:
         FrameError: not depth, an unknown encoding, or too few bytes; the message contains `name`.
     """
     if kind == IMAGE:
-        if message.encoding not in DEPTH_ENCODINGS:
+        if encoding_of(kind, message) not in DEPTH_ENCODINGS:
             raise FrameError(
                 f"{name}: encoding {message.encoding[:40]!r} is not depth: expected {', '.join(DEPTH_ENCODINGS)}"
             )
@@ -162,13 +169,14 @@ def _is_inverse(form: str, slope: float) -> bool:
 
 def _pixels(message: Any, name: str) -> np.ndarray:
     """The pixels of a raw image message, not converted, [h, w] or [h, w, channels]."""
-    layout = LAYOUTS.get(message.encoding)
+    encoding = _spelled(message.encoding)
+    layout = LAYOUTS.get(encoding)
     if layout is None:
         raise FrameError(f"{name}: encoding {message.encoding[:40]!r} is not one of {', '.join(LAYOUTS)}")
     number, channels, _ = layout
     dtype = np.dtype(number).newbyteorder(">" if message.is_bigendian else "<")
     height, width, step = int(message.height), int(message.width), int(message.step)
-    if message.encoding in HALVED:
+    if encoding in HALVED:
         if height % 2 or width % 2:
             raise FrameError(
                 f"{name}: {width}x{height} pixels of {message.encoding}, which needs an even width and height"

@@ -45,15 +45,3 @@ def test_images_in_folders_of_their_own_are_told(tmp_path: Path) -> None:
     image(tmp_path / "depth/cam0/0.png", raw(METRES[0], 1000))
     with pytest.raises(GavoError, match=r"no colour images in rgb \(cam0\): if they are in cam0/, link it as rgb/"):
         open_source(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["timestamps.txt", "times.txt"])
-def test_a_list_of_times_that_is_not_read_is_told(tmp_path: Path, name: str) -> None:
-    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
-        image(tmp_path / f"rgb/{i}.png", grey)
-        image(tmp_path / f"depth/{i}.png", raw(metres, 1000))
-    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
-    (tmp_path / name).write_text("0.0\n0.1\n0.2\n0.3\n")
-    sequence = open_source(tmp_path)
-    said = [line for line in getattr(sequence, "left_out", ()) if line.startswith(name)]
-    assert said == [f"{name}: times are not read from it: name the images by them, or pass --rate"]

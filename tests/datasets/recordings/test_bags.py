@@ -23,7 +23,7 @@ from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.recordings import recording
 from gavo_jax.datasets.recordings.bags import BagSequence
-from gavo_jax.datasets.recordings.messages import HALVED, LAYOUTS, color_of, depth_of
+from gavo_jax.datasets.recordings.messages import HALVED, LAYOUTS, color_of, depth_of, encoding_of, is_depth
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.errors import GavoError
 from gavo_jax.inspection import summary
@@ -900,6 +900,22 @@ def message(pixels: np.ndarray, encoding: str, **changes: object) -> SimpleNames
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 PLAIN = np.full((8, 12, 3), (30, 90, 200), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("spelled", "usual"), [("RGB8", "rgb8"), ("Mono8", "mono8"), ("Y8", "mono8"), ("BAYER_RGGB8", "bayer_rggb8")]
+)
+def test_encodings_are_known_by_other_spellings(spelled, usual):
+    pixels = BGRS[0] if usual == "rgb8" else GREYS[0]
+    image, expected = (color_of(IMAGE, message(pixels, encoding), "image") for encoding in (spelled, usual))
+    assert np.array_equal(image, expected)
+    assert encoding_of(IMAGE, message(pixels, spelled)) == usual
+
+
+@pytest.mark.parametrize("spelled", ["16uc1", "z16", "MONO16"])
+def test_encodings_of_depth_are_known_by_other_spellings(spelled):
+    assert np.array_equal(depth_of(IMAGE, message(MILLIMETRES[0], spelled), "image"), MILLIMETRES[0])
+    assert is_depth(IMAGE, message(MILLIMETRES[0], spelled), "/depth/image")
 
 
 @pytest.mark.parametrize("encoding", [name for name, layout in LAYOUTS.items() if layout[0] in ("u1", "u2")])

@@ -1,0 +1,97 @@
+"""Times of numbered frames that a list beside the images states."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from written_folders import CAMERA_TOML, GREYS, METRES, image, raw
+
+from gavo_jax.datasets.files import Reading
+from gavo_jax.datasets.registry import open_source
+
+STEPS = np.array([0.0, 0.033, 0.1, 0.133])[: len(GREYS)]
+"""Times of the frames, seconds: the second gap is that of a dropped frame."""
+
+
+def numbered(folder: Path, name: str = "{:04d}.png") -> Path:
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
+        image(folder / "rgb" / name.format(i), grey)
+        image(folder / "depth" / name.format(i), raw(metres, 1000))
+    (folder / "camera.toml").write_text(CAMERA_TOML)
+    return folder
+
+
+def rows(form: str, scale: float = 1.0, start: float = 0.0) -> str:
+    stamps = [(start + step) * scale for step in STEPS]
+    return "".join(form.format(i=i, t=t, n=round(t)) + "\n" for i, t in enumerate(stamps))
+
+
+@pytest.mark.parametrize("name", ["timestamps.txt", "timestamp.txt", "times.txt", "timestamps.csv", "rgb/times.txt"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        rows("{t:.3f}"),
+        rows("{t:.6e}"),  # KITTI's odometry
+        rows("{t:.6f}", 1, 1.6e9),
+        rows("{n}", 1e9, 1.6e9),
+        rows("{n}", 1e3, 1.6e9),
+        rows("{n}", 1e6, 12.0),
+        rows("{i} {t:.3f}"),
+        rows("{i:06d} {t:.3f}"),
+        rows("{t:.3f} rgb/{i:04d}.png"),
+        rows("{n},{i:04d}.png", 1e9, 1.6e9),
+        "timestamp,file\n" + rows("{t:.3f},{i:04d}.png"),
+        "#timestamp [ns],filename\n" + rows("{n},{i:04d}.png", 1e9, 1.6e9),  # EuRoC's
+        "\n".join(reversed(rows("{i:04d} {t:.3f}").splitlines())),
+        rows("{i:04d} {t:.3f}") + "0009 5.0\n",
+        rows("2011-09-26 13:02:{t:.9f}", 1, 25.5),  # KITTI's raw data
+    ],
+)
+def test_frames_have_the_times_of_the_list(tmp_path: Path, name: str, text: str) -> None:
+    numbered(tmp_path)
+    (tmp_path / name).write_text(text)
+    sequence = open_source(tmp_path)
+    assert np.allclose(np.asarray(sequence.timestamps) - sequence.timestamps[0], STEPS, atol=2e-6)
+    assert not getattr(sequence, "times_guessed", "")
+    assert not getattr(sequence, "left_out", [])
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (rows("{t:.3f}") + "0.2\n", f"{len(GREYS) + 1} rows, but {len(GREYS)} colour images"),
+        ("", f"0 rows, but {len(GREYS)} colour images"),
+        (rows("{i}"), "its rows are no times of a known unit"),
+        (rows("some {i} words {t:.3f}"), "its rows are no times"),
+        (rows("1e999"), "its rows are no times of a known unit"),
+        (rows("{i:04d} {t:.3f}", -1.0), "they do not increase from frame to frame"),
+        (rows("{t:.3f}", 0.0), "they do not increase from frame to frame"),
+        ("\n".join(rows("{i:04d} {t:.3f}").splitlines()[1:]), "no row for 0000.png"),
+        (rows("9" * 5000), "its rows are no times of a known unit"),
+    ],
+)
+def test_a_list_that_is_not_read_is_told(tmp_path: Path, text: str, why: str) -> None:
+    numbered(tmp_path)
+    (tmp_path / "times.txt").write_text(text)
+    sequence = open_source(tmp_path)
+    told = f"times.txt: times are not read from it ({why}): name the images by them, or pass --rate"
+    assert list(getattr(sequence, "left_out", [])) == [told]
+    assert sequence.timestamps[1] - sequence.timestamps[0] == pytest.approx(1 / 30)
+
+
+def test_a_rate_and_names_that_are_times_take_precedence(tmp_path: Path) -> None:
+    (numbered(tmp_path / "a") / "times.txt").write_text(rows("{t:.3f}"))
+    (numbered(tmp_path / "b", "{:04d}.png") / "times.txt").write_bytes(b"\xff\xfe")
+    given = open_source(tmp_path / "a", Reading(rate=10))
+    assert given.timestamps[1] - given.timestamps[0] == pytest.approx(0.1)
+    assert not getattr(given, "left_out", [])
+    assert "not a text file (UTF-8)" in " ".join(open_source(tmp_path / "b").left_out)  # type: ignore[attr-defined]
+    folder = tmp_path / "c"
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
+        image(folder / f"rgb/{1000 + i / 15:.6f}.png", grey)
+        image(folder / f"depth/{1000 + i / 15:.6f}.png", raw(metres, 1000))
+    (folder / "camera.toml").write_text(CAMERA_TOML)
+    (folder / "times.txt").write_text(rows("{t:.3f}"))
+    named = open_source(folder)
+    assert named.timestamps[0] == 1000
+    assert not getattr(named, "left_out", [])
