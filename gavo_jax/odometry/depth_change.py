@@ -34,6 +34,8 @@ MOST_LEFT = 0.7
 """Largest part of the change of depth that the motions may leave unexplained; 1 is no better than rest. Clean clips
 reach 0.24, and 0.42 with a body over 40 % of the image.
 """
+MOST_WITHOUT_BODIES = 0.5
+"""Part that is left without bodies over the one with them, below which bodies are why depth seemed wrong."""
 RIGHT_BEFORE = 5
 """Surplus of pairs whose change of depth was explained, counted from the first remembered one, that shows that depth
 was right until then.
@@ -77,21 +79,44 @@ class DepthChange(NamedTuple):
         return covered - (int(np.argmax(more_explained)) + 1 if was_right else 0)
 
     def after(
-        self, frame: Frame, elapsed: float, target_T_reference: Any, explained: float, camera: Camera
+        self,
+        frame: Frame,
+        at_rest: Frame,
+        elapsed: float,
+        target_T_reference: Any,
+        explained: float,
+        camera: Camera,
     ) -> "DepthChange":
         """Add one more pair, of the same reference.
 
-        Depth of a single value in both frames fits a wall along which the camera translates. Rotations are then found
-        as translations, and depth agrees. So the image has to fit a wall as well.
+        Earlier figures above `MOST_LEFT` are forgotten if bodies make the difference in this pair: before they were
+        found, they caused these figures. Near bodies in a far room are all of the depth that changes.
 
         Args:
-            frame: The target, without what moves on its own.
+            frame: The target.
+            at_rest: The same frame without what moves on its own; the same object if nothing does.
             elapsed: Time between the two images, seconds.
             target_T_reference: Motion between the two images.
             explained: Share of the grey residuals that are not large.
             camera: Camera of both frames.
         """
         twist = log(np.asarray(target_T_reference, np.float64)) / elapsed
+        left = self._left_in(at_rest, elapsed, twist, explained, camera)
+        figures = (*self.left, left)[-REMEMBERED:] if np.isfinite(left) else self.left
+        if at_rest is not frame and max(figures, default=0.0) > MOST_LEFT:
+            with_bodies = self._left_in(frame, elapsed, twist, explained, camera)
+            if left < min(MOST_LEFT, MOST_WITHOUT_BODIES * with_bodies):
+                figures = tuple(figure for figure in figures if figure <= MOST_LEFT)
+        return self._replace(velocity=tuple(twist.tolist()), left=figures)
+
+    def _left_in(
+        self, frame: Frame, elapsed: float, twist: Float64[np.ndarray, "6"], explained: float, camera: Camera
+    ) -> float:
+        """Part of the change of depth that a motion leaves; NaN if too little changes.
+
+        Depth of a single value in both frames fits a wall along which the camera translates. Rotations are then found
+        as translations, and depth agrees. So the image has to fit a wall as well.
+        """
         earlier = np.array(self.velocity or twist)
 
         def moved_by(seconds: float) -> Float64[np.ndarray, "4 4"]:
@@ -102,8 +127,7 @@ class DepthChange(NamedTuple):
         left = left_unexplained(self.inverse, np.asarray(frame.depth), motion, camera)
         if not np.isfinite(left) and explained < LEAST_EXPLAINED:
             left = 1.0 if _is_one_number(self.inverse) and _is_one_number(depth_on_grid(frame, camera)) else left
-        figures = (*self.left, left)[-REMEMBERED:] if np.isfinite(left) else self.left
-        return self._replace(velocity=tuple(twist.tolist()), left=figures)
+        return left
 
     def seen_from(self, frame: Frame, camera: Camera) -> "DepthChange":
         """Continue with another reference."""

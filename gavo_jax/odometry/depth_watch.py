@@ -57,7 +57,7 @@ def judge_by_depth(
         return result, watch
     explained = float(result.explained.grey)
     at_rest = without_moving(frame, covered(bodies), border=0.0)
-    change = watch.change.after(at_rest, elapsed, result.target_T_reference, explained, camera)
+    change = watch.change.after(frame, at_rest, elapsed, result.target_T_reference, explained, camera)
     watch = watch._replace(change=change)
     watch = watch._replace(found_wrong=watch.is_wrong)
     return with_finding(result, AlignmentStatus.DEPTH_MISMATCH) if watch.found_wrong else result, watch

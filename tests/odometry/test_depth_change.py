@@ -157,12 +157,40 @@ def test_of_half_of_the_pairs_a_body_may_be_why_that_was_not_known_yet() -> None
     assert not change.is_unexplained and change._replace(left=(1.9,) * 5 + (0.1,) * 4).is_unexplained
 
 
-def test_depth_where_a_body_moves_says_nothing() -> None:
+def half_body() -> Seen:
+    """A body that covers the left half of the image."""
     field = np.where(np.arange(80) < 40, 1.0, -1.0) * np.ones((60, 1))
-    body = Seen(1, field.astype(np.float32), 0.5, np.zeros(3))
+    return Seen(1, field.astype(np.float32), 0.5, np.zeros(3))
+
+
+def test_depth_where_a_body_moves_says_nothing() -> None:
+    body = half_body()
     halves = [replace(f, depth=np.where(np.arange(160) < 80, np.flipud(f.depth), f.depth)) for f in room()[0]]
     assert not is_unexplained(halves, (body,)) and is_unexplained(halves)
     assert is_unexplained([replace(f, depth=np.flipud(f.depth)) for f in room()[0]], (body,))
+
+
+@pytest.mark.parametrize(
+    ("known_from", "is_told"), [(MIN_REMEMBERED - 1, False), (MIN_REMEMBERED, False), (FRAMES - 1, True)]
+)
+def test_a_body_that_was_found_late_is_why_depth_seemed_wrong(known_from: int, is_told: bool) -> None:
+    """In a far room with two near bodies, found after seven pairs, depth of the first thirteen was said to be wrong."""
+
+    class Learning(Knowing):
+        def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+            attempt = super().align(state, frame, clock)
+            return attempt if frame.timestamp >= room()[0][known_from].timestamp else attempt._replace(bodies=())
+
+    def told(damage: Callable[[np.ndarray], np.ndarray]) -> bool:
+        odometry, unexplained = Odometry(CAMERA, aligner=Learning((half_body(),))), []
+        for frame in room()[0]:
+            odometry.register(replace(frame, depth=damage(frame.depth)), frame.timestamp)
+            assert odometry.progress.depth is not None
+            unexplained.append(odometry.progress.depth.change.is_unexplained)
+        return any(unexplained)
+
+    assert told(lambda depth: np.where(np.arange(160) < 80, np.flipud(depth), depth)) == is_told
+    assert told(np.flipud)
 
 
 @pytest.mark.parametrize("depth", [np.zeros((120, 160), np.uint16), np.full((120, 160), np.nan, np.float32)])
