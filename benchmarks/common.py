@@ -156,13 +156,22 @@ def open_clip(text: str) -> FrameSequence:
     frames = int(count) if count else CLIP_FRAMES.get(name)
     if name == "synthetic":
         return SyntheticSequence(frames)
+    return open_source(folder_of(name))[:frames]
+
+
+def folder_of(name: str) -> Path:
+    """The folder of that path, else that of GAVO_DATA.
+
+    Raises:
+        GavoError: no such folder, and GAVO_DATA is not set.
+    """
     folder = Path(name)
-    if not folder.is_dir():
-        data = os.environ.get("GAVO_DATA")
-        if not data:
-            raise GavoError(f"{name}: no such folder, and GAVO_DATA does not name the folder of the clips")
-        folder = Path(data) / name
-    return open_source(folder)[:frames]
+    if folder.is_dir():
+        return folder
+    data = os.environ.get("GAVO_DATA")
+    if not data:
+        raise GavoError(f"{name}: no such folder, and GAVO_DATA does not name the folder of the clips")
+    return Path(os.path.expanduser(data)) / name  # no shell expands it in environment files
 
 
 def open_true_clip(text: str) -> tuple[FrameSequence, Trajectory]:

@@ -345,9 +345,7 @@ def main(
             [[row["frames"], *(number(row[k], 1) for k in keys), *(row[k] for k in counted)] for row in rows],
         )
     if "covered" in wanted:
-        scenes: list[Sequence] = [
-            open_source(str(Path(os.environ.get("GAVO_DATA", "")) / name)) for name in common.names(foreign)
-        ]
+        scenes: list[Sequence] = [open_source(common.folder_of(name)) for name in common.names(foreign)]
         scenes += [SyntheticSequence(60, seed=seed) for seed in range(4)]
         results["covered"] = found = try_covered(map_of, tried, scenes, settings, tries, foreign_tries)
         common.print_table(

@@ -236,7 +236,8 @@ def test_a_foreign_frame_has_depth_in_the_units_of_the_map(load) -> None:
 def test_clips_are_found_by_name(monkeypatch: pytest.MonkeyPatch, data_dir: Path) -> None:
     monkeypatch.syspath_prepend(str(FOLDER))
     open_clip = importlib.import_module("common").open_clip
-    monkeypatch.setenv("GAVO_DATA", str(data_dir))
+    monkeypatch.setenv("HOME", str(data_dir.parent))
+    monkeypatch.setenv("GAVO_DATA", f"~/{data_dir.name}")  # no shell expands it in environment files
     assert len(open_clip("fr1_xyz")) == 90
     assert len(open_clip("fr1_xyz:12")) == 12
     assert len(open_clip("synthetic:3")) == 3
