@@ -57,6 +57,8 @@ def _times_of(images: dict[int, Path], rows: list[tuple[str, list[str]]]) -> dic
         fields = fields[1:]
     numbers, texts = _columns(images, fields)
     times = dict(zip(numbers, _seconds(texts), strict=True))
+    if len(times) < len(numbers):
+        raise GavoError("more than one row for an image")
     if missing := images.keys() - times.keys():
         raise GavoError(f"no row for {images[min(missing)].name}")
     times = {n: times[n] for n in sorted(images)}

@@ -65,6 +65,7 @@ def test_frames_have_the_times_of_the_list(tmp_path: Path, name: str, text: str)
         (rows("some {i} words {t:.3f}"), "its rows are no times"),
         (rows("1e999"), "its rows are no times of a known unit"),
         (rows("{i:04d} {t:.3f}", -1.0), "they do not increase from frame to frame"),
+        (rows("rgb/{i:04d}.png {t:.3f}") + rows("depth/{i:04d}.png {t:.4f}"), "more than one row for an image"),
         (rows("{t:.3f}", 0.0), "they do not increase from frame to frame"),
         ("\n".join(rows("{i:04d} {t:.3f}").splitlines()[1:]), "no row for 0000.png"),
         (rows("9" * 5000), "its rows are no times of a known unit"),
