@@ -12,17 +12,11 @@ from gavo_jax.trajectory import (
     Trajectory,
     associate,
     inverse,
-    quaternion_from_rotation,
     require_trajectory,
-    rotation_from_quaternion,
 )
 
 MAX_DIFFERENCE = 0.02
 """Stamps of estimate and truth at least this far apart, in seconds, are not associated."""
-
-REORDERED, LARGE = 0.25, 2.0
-"""Quaternions are taken to be w-first if that order leaves less than this share of the median rotation error over one
-second, and that error exceeds this many degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,27 +201,6 @@ def _known(trajectory: Trajectory) -> Trajectory:
     trajectory.require_rigid()
     known = np.isfinite(trajectory.world_T_camera).all(axis=(1, 2)) & np.isfinite(trajectory.timestamps)
     return trajectory if known.all() else trajectory[known]
-
-
-def is_w_first(trajectory: Trajectory, other: Trajectory) -> bool:
-    """Whether a file has its quaternions as w x y z instead of x y z w, judged by another trajectory.
-
-    The file alone does not show it: the wrong order leaves motions as large and as smooth. But two trajectories that
-    disagree, and agree once this one is reordered, do. Misread quaternions are the inverse rotations between two fixed
-    ones, so inverse poses of a camera that turns about one axis look alike; those are not reported.
-    """
-
-    def error(quaternions: Float[np.ndarray, "n 4"]) -> float:
-        poses = trajectory.world_T_camera.copy()
-        poses[:, :3, :3] = rotation_from_quaternion(quaternions)
-        return relative_pose_error(other, replace(trajectory, world_T_camera=poses)).rotation.median
-
-    quaternions = quaternion_from_rotation(trajectory.world_T_camera[:, :3, :3])
-    try:
-        least = min(error(quaternions), error(quaternions * [-1, -1, -1, 1]))
-        return least > LARGE and error(quaternions[:, [1, 2, 3, 0]]) < REORDERED * least
-    except GavoError:
-        return False
 
 
 def align_rigidly(

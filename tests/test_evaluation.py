@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from evo.core import metrics, sync
 from evo.tools import file_interface
+from paths import CLIPS, perturbed, real_pair, smooth_truth, transform
 from scipy.spatial.transform import Rotation
 
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
@@ -15,46 +16,10 @@ from gavo_jax.evaluation import (
     ErrorSeries,
     absolute_trajectory_error,
     distance_error,
-    is_w_first,
     relative_pose_error,
     rotation_angle,
 )
-from gavo_jax.trajectory import Trajectory, inverse, quaternion_from_rotation, rotation_from_quaternion
-
-CLIPS = ["fr1_xyz", "fr1_desk", "fr1_rpy"]
-
-
-def transform(rotation_vector, translation) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(rotation_vector).as_matrix()
-    matrix[:3, 3] = translation
-    return matrix
-
-
-def smooth_truth(seconds: float = 4.0, rate: float = 100.0, seed: int = 0) -> Trajectory:
-    rng = np.random.default_rng(seed)
-    stamps = 1000 + np.arange(0, seconds, 1 / rate) + rng.uniform(-0.001, 0.001, int(round(seconds * rate)))
-    phase = rng.uniform(0, 6, 6)
-    waves = 0.5 * np.sin(stamps[:, None] * [1.0, 1.3, 0.7, 0.9, 1.1, 0.6] + phase)
-    return Trajectory(stamps, np.array([transform(row[:3], row[3:]) for row in waves]))
-
-
-def perturbed(truth: Trajectory, stamps: np.ndarray, seed: int, degree: float = 1.0) -> Trajectory:
-    """An odometry of `truth`: first pose the identity, every step off by a few millimetres and tenths of a degree."""
-    rng = np.random.default_rng(seed)
-    true, valid = truth.interpolate(stamps)
-    assert valid.all()
-    world_T_camera = [np.eye(4)]
-    for before, after in zip(true[:-1], true[1:], strict=True):
-        noise = transform(rng.normal(0, 0.005 * degree, 3), rng.normal(0, 0.004 * degree, 3))
-        world_T_camera.append(world_T_camera[-1] @ inverse(before) @ after @ noise)
-    return Trajectory(stamps, np.array(world_T_camera))
-
-
-def real_pair(folder, seed=0) -> tuple[Trajectory, Trajectory]:
-    truth = Trajectory.read_tum(folder / "groundtruth.txt")
-    stamps = np.loadtxt(folder / "rgb.txt", usecols=0)
-    return perturbed(truth, stamps, seed), truth
+from gavo_jax.trajectory import Trajectory, inverse
 
 
 def bisect_nearest(stamps: list, wanted: float) -> int:
@@ -369,35 +334,6 @@ def test_what_is_no_trajectory_is_refused(other):
 def test_rotation_angles_are_exact_at_both_ends(angle):
     rotation = Rotation.from_rotvec(np.array([0.6, 0.0, 0.8]) * angle).as_matrix()
     assert rotation_angle(rotation[None])[0] == pytest.approx(angle, abs=1e-12)
-
-
-def w_first(trajectory: Trajectory) -> Trajectory:
-    """As read from a file that has w x y z."""
-    poses = trajectory.world_T_camera.copy()
-    poses[:, :3, :3] = rotation_from_quaternion(quaternion_from_rotation(poses[:, :3, :3])[:, [3, 0, 1, 2]])
-    return Trajectory(trajectory.timestamps, poses)
-
-
-@pytest.mark.parametrize("clip", CLIPS)
-def test_quaternions_of_the_other_order_are_told(data_dir, clip):
-    noisy, truth = real_pair(data_dir / clip)
-    estimate = perturbed(truth, noisy.timestamps, 0, 0.3)
-    inverted = Trajectory(truth.timestamps, inverse(truth.world_T_camera))
-    for one, other in ((estimate, truth), (truth, estimate)):
-        assert is_w_first(w_first(one), other)
-        assert not is_w_first(one, other) and not is_w_first(one, w_first(other))
-    for one, other in ((noisy, truth), (truth, noisy), (estimate, inverted), (inverted, estimate)):
-        assert not is_w_first(one, other)
-
-
-@pytest.mark.parametrize("axis", np.eye(3))
-def test_inverse_poses_of_a_turn_about_one_axis_are_not_taken_for_the_other_order(axis):
-    stamps = np.arange(100) / 30
-    turn, back = (
-        Trajectory(stamps, np.array([transform(axis * sign * 0.4 * t, np.zeros(3)) for t in stamps]))
-        for sign in (1, -1)
-    )
-    assert not is_w_first(turn, turn) and not is_w_first(back, turn)
 
 
 def test_poses_of_one_moment_have_no_drift_over_a_second():

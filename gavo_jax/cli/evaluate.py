@@ -16,7 +16,6 @@ from gavo_jax.evaluation import (
     ErrorSeries,
     absolute_trajectory_error,
     distance_error,
-    is_w_first,
     relative_pose_error,
 )
 from gavo_jax.output import plots
@@ -24,6 +23,7 @@ from gavo_jax.output.drawing import draw
 from gavo_jax.output.files import COMPARISON, FRAMES, prepare_folder, refuse_foreign
 from gavo_jax.output.screen import number, print_table, say, waiting
 from gavo_jax.trajectory import Trajectory, associate
+from gavo_jax.trajectory_doubts import is_w_first, relative_size
 
 UNITS = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
 """Units, in seconds, that timestamps may have instead of seconds."""
@@ -71,12 +71,14 @@ def _check(options: Evaluate) -> None:
 
 
 def _remarks(paths: tuple[Path, Path], read: list[tuple[Trajectory, float]]) -> Iterator[str]:
-    """Yield a remark for each file that was not read literally."""
+    """Yield a remark for each file that was not read literally, or disagrees as a whole."""
     for path, (one, unit), (other, _) in zip(paths, read, reversed(read), strict=True):
         if unit in UNITS:
             yield f"{path}: its stamps are taken as {UNITS[unit]}"
         if is_w_first(one, other):
             yield f"{path}: its rotations agree only if its quaternions are read as w x y z; write them as x y z w"
+    if size := relative_size(read[0][0], read[1][0]):
+        yield f"{paths[0]}: it has {size:.3g} times the size of {paths[1]}, and the errors do not allow for that"
 
 
 NAMES = ("rpe_translation", "rpe_rotation", "ate", "distance_error")

@@ -1,6 +1,7 @@
 """`gavo run`: estimates a sequence's trajectory, with errors and figures."""
 
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,6 @@ from gavo_jax.datasets.live.devices import is_live
 from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED, LOST
 from gavo_jax.errors import print_message
-from gavo_jax.evaluation import is_w_first
 from gavo_jax.inspection import left_out, left_out_in_short, summary
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper
@@ -44,6 +44,7 @@ from gavo_jax.output.trajectories import formats, remove_trajectories, write_tra
 from gavo_jax.settings import Settings
 from gavo_jax.settings_check import as_seed
 from gavo_jax.trajectory import Trajectory
+from gavo_jax.trajectory_doubts import is_w_first, relative_size
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
 
@@ -102,12 +103,22 @@ def run(options: Run) -> int:
         if options.map is not None:
             save_map(options.map, sequence, folder, trajectory, shape, options.voxel)
         write_trajectories(trajectory, folder.path, trajectory_formats)
-    if truth is not None and is_w_first(truth, trajectory):
-        say("The ground truth agrees only if its quaternions are read as w x y z; write them as x y z w.")
+    for line in _doubts(trajectory, truth, sequence.camera.depth_scale) if truth is not None else ():
+        say(line)
     if interrupted:
         return INTERRUPTED
     viewer.stay()
     return LOST if options.strict and metrics["lost_pairs"] else 0
+
+
+def _doubts(trajectory: Trajectory, truth: Trajectory, depth_scale: float) -> Iterator[str]:
+    """Yield a line for each reason for which the run and the ground truth disagree as a whole."""
+    if is_w_first(truth, trajectory):
+        yield "The ground truth agrees only if its quaternions are read as w x y z; write them as x y z w."
+    if size := relative_size(trajectory, truth):
+        yield f"The trajectory has {size:.3g} times the size of the ground truth. It would agree if depth had " + (
+            f"{size * depth_scale:.4g} units per metre (--depth-scale), not {depth_scale:g}."
+        )
 
 
 def _start(options: Run, sequence: Sequence, folder: RunFolder, config: dict[str, Any]) -> None:

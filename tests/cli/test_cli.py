@@ -96,7 +96,7 @@ def is_refused(done: Done, *words: str) -> bool:
 def test_run_writes_its_files(gavo, pristine, tmp_path):
     camera = ("--camera", pristine / "camera.toml")
     done = gavo("run", pristine, *camera, "--seed", 3, "--output", tmp_path / "out", *FAST)
-    assert done.status == 0, done.err
+    assert done.status == 0 and "times the size" not in done.out, done.err
     out = tmp_path / "out"
     metrics = read_json(out / "metrics.json")
     assert set(METRICS) <= set(metrics)
@@ -566,6 +566,19 @@ def test_evaluate_tells_quaternions_of_the_other_order(gavo, tmp_path):
     words = "agree only if its quaternions are read as w x y z"
     assert f"other: its rotations {words}" in gavo("evaluate", tmp_path / "right", tmp_path / "other").out
     assert words not in gavo("evaluate", tmp_path / "right", tmp_path / "right").out
+
+
+def test_a_size_unlike_the_ground_truths_is_told(gavo, pristine, tmp_path):
+    """As of depth in a unit that is plausible, and wrong; nothing within a run shows it."""
+    camera, out = ("--camera", pristine / "camera.toml"), tmp_path / "out"
+    done = gavo("run", pristine, *camera, "--depth-scale", 1.5 * CAMERA.depth_scale, "--output", out, *FAST)
+    told = re.search(r"The trajectory has (0\.\d+) times the size of the ground truth\. .* depth had (\d+)", done.out)
+    assert done.status == 0 and told, done.out
+    assert float(told[1]) == pytest.approx(1 / 1.5, rel=0.05)
+    assert float(told[2]) == pytest.approx(CAMERA.depth_scale, rel=0.05)
+    truth = pristine / "groundtruth.txt"
+    assert "times the size of" in gavo("evaluate", out / "trajectory.txt", truth).out
+    assert "times the size" not in gavo("evaluate", truth, truth).out
 
 
 def test_evaluate_tells_what_can_be_had(gavo, tmp_path):

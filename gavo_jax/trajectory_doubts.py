@@ -1,0 +1,71 @@
+"""Why a trajectory may disagree with another as a whole: the order of its quaternions, or its size."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from gavo_jax.errors import GavoError
+from gavo_jax.evaluation import align_rigidly, relative_pose_error
+from gavo_jax.trajectory import Trajectory, quaternion_from_rotation, rotation_from_quaternion
+
+REORDERED, LARGE = 0.25, 2.0
+"""Quaternions are taken to be w-first if that order leaves less than this share of the median rotation error over one
+second, and that error exceeds this many degrees."""
+
+OTHER_SIZE = 1.15
+"""Ratio of two sizes above which they differ."""
+
+FEWEST_POSES = 10
+"""Fewest poses that show a size."""
+
+SIMILAR, MUCH_BETTER = 0.25, 0.33
+"""Two trajectories differ in size only if a similarity leaves at most this share of the true path, and of what a rigid
+motion leaves."""
+
+
+def is_w_first(trajectory: Trajectory, other: Trajectory) -> bool:
+    """Whether a file has its quaternions as w x y z instead of x y z w, judged by another trajectory.
+
+    The file alone does not show it: the wrong order leaves motions as large and as smooth. But two trajectories that
+    disagree, and agree once this one is reordered, do. Misread quaternions are the inverse rotations between two fixed
+    ones, so inverse poses of a camera that turns about one axis look alike; those are not reported.
+    """
+
+    def error(quaternions: Float[np.ndarray, "n 4"]) -> float:
+        poses = trajectory.world_T_camera.copy()
+        poses[:, :3, :3] = rotation_from_quaternion(quaternions)
+        return relative_pose_error(other, replace(trajectory, world_T_camera=poses)).rotation.median
+
+    quaternions = quaternion_from_rotation(trajectory.world_T_camera[:, :3, :3])
+    try:
+        least = min(error(quaternions), error(quaternions * [-1, -1, -1, 1]))
+        return least > LARGE and error(quaternions[:, [1, 2, 3, 0]]) < REORDERED * least
+    except GavoError:
+        return False
+
+
+def relative_size(estimate: Trajectory, truth: Trajectory) -> float | None:
+    """Size of an estimate over that of the truth if the two differ in nothing else; None if they do not.
+
+    Depth in a wrong unit scales all motions alike, so that nothing within the run shows it. The longest segment is
+    aligned rigidly, and then scaled about its centre (Umeyama 1991); its errors are those of positions.
+    """
+    try:
+        true, covered = truth.interpolate(estimate.timestamps)
+    except GavoError:
+        return None
+    known = covered & np.isfinite(estimate.world_T_camera).all(axis=(1, 2)) & np.isfinite(true).all(axis=(1, 2))
+    if not known.any():
+        return None
+    chosen = known & (estimate.segments == np.bincount(estimate.segments[known]).argmax())
+    points, targets = estimate.world_T_camera[chosen, :3, 3], true[chosen, :3, 3]
+    if len(points) < FEWEST_POSES:
+        return None
+    rotation, _ = align_rigidly(points, targets)
+    turned, centered = (points - points.mean(axis=0)) @ rotation.T, targets - targets.mean(axis=0)
+    scale = float(np.sum(turned * centered) / max(np.sum(turned**2), np.finfo(float).tiny))
+    if scale <= 0 or 1 / OTHER_SIZE < scale < OTHER_SIZE:
+        return None
+    similar, rigid = (float(np.linalg.norm(some - centered)) for some in (scale * turned, turned))
+    return 1 / scale if similar < min(SIMILAR * float(np.linalg.norm(centered)), MUCH_BETTER * rigid) else None
