@@ -20,6 +20,7 @@ from gavo_jax.cli.selection import (
 )
 from gavo_jax.datasets.assembly import recorded_as
 from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.depth_unit import unit_of_file
 from gavo_jax.datasets.live.devices import is_live
 from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED, LOST
@@ -103,7 +104,7 @@ def run(options: Run) -> int:
         if options.map is not None:
             save_map(options.map, sequence, folder, trajectory, shape, options.voxel)
         write_trajectories(trajectory, folder.path, trajectory_formats)
-    for line in _doubts(trajectory, truth, sequence.camera.depth_scale) if truth is not None else ():
+    for line in _doubts(trajectory, truth, unit_of_file(sequence)) if truth is not None else ():
         say(line)
     if interrupted:
         return INTERRUPTED
@@ -111,13 +112,19 @@ def run(options: Run) -> int:
     return LOST if options.strict and metrics["lost_pairs"] else 0
 
 
-def _doubts(trajectory: Trajectory, truth: Trajectory, depth_scale: float) -> Iterator[str]:
-    """Yield a line for each reason for which the run and the ground truth disagree as a whole."""
+def _doubts(trajectory: Trajectory, truth: Trajectory, units: float) -> Iterator[str]:
+    """Yield a line for each reason for which the run and the ground truth disagree as a whole.
+
+    Args:
+        trajectory: The estimate.
+        truth: The ground truth.
+        units: Depth units per metre in the source's files.
+    """
     if is_w_first(truth, trajectory):
         yield "The ground truth agrees only if its quaternions are read as w x y z; write them as x y z w."
     if size := relative_size(trajectory, truth):
         yield f"The trajectory has {size:.3g} times the size of the ground truth. It would agree if depth had " + (
-            f"{size * depth_scale:.4g} units per metre (--depth-scale), not {depth_scale:g}."
+            f"{size * units:.4g} units per metre (--depth-scale), not {units:g}."
         )
 
 

@@ -568,14 +568,23 @@ def test_evaluate_tells_quaternions_of_the_other_order(gavo, tmp_path):
     assert words not in gavo("evaluate", tmp_path / "right", tmp_path / "right").out
 
 
-def test_a_size_unlike_the_ground_truths_is_told(gavo, pristine, tmp_path):
+@pytest.mark.parametrize("units", [CAMERA.depth_scale, 1.0])
+def test_a_size_unlike_the_ground_truths_is_told(gavo, pristine, tmp_path, units):
     """As of depth in a unit that is plausible, and wrong; nothing within a run shows it."""
-    camera, out = ("--camera", pristine / "camera.toml"), tmp_path / "out"
-    done = gavo("run", pristine, *camera, "--depth-scale", 1.5 * CAMERA.depth_scale, "--output", out, *FAST)
-    told = re.search(r"The trajectory has (0\.\d+) times the size of the ground truth\. .* depth had (\d+)", done.out)
+    source, camera, out = tmp_path / "source", ("--camera", pristine / "camera.toml"), tmp_path / "out"
+    shutil.copytree(pristine, source)
+    if units == 1:
+        for file in images(source, "depth"):
+            metres = cv2.imread(str(file), cv2.IMREAD_UNCHANGED).astype(np.float32) / np.float32(CAMERA.depth_scale)
+            cv2.imwrite(str(file.with_suffix(".tiff")), metres)
+        (source / "depth.txt").write_text((source / "depth.txt").read_text().replace(".png", ".tiff"))
+    done = gavo("run", source, *camera, "--depth-scale", 1.5 * units, "--output", out, *FAST)
+    told = re.search(
+        r"The trajectory has (0\.\d+) times the size of the ground truth\. .* depth had ([\d.]+) units", done.out
+    )
     assert done.status == 0 and told, done.out
     assert float(told[1]) == pytest.approx(1 / 1.5, rel=0.05)
-    assert float(told[2]) == pytest.approx(CAMERA.depth_scale, rel=0.05)
+    assert float(told[2]) == pytest.approx(units, rel=0.05)
     truth = pristine / "groundtruth.txt"
     assert "times the size of" in gavo("evaluate", out / "trajectory.txt", truth).out
     assert "times the size" not in gavo("evaluate", truth, truth).out
