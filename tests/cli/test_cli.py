@@ -575,8 +575,8 @@ def test_a_size_unlike_the_ground_truths_is_told(gavo, pristine, tmp_path, units
     shutil.copytree(pristine, source)
     if units == 1:
         for file in images(source, "depth"):
-            metres = cv2.imread(str(file), cv2.IMREAD_UNCHANGED).astype(np.float32) / np.float32(CAMERA.depth_scale)
-            cv2.imwrite(str(file.with_suffix(".tiff")), metres)
+            metres = np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float32) / CAMERA.depth_scale
+            cv2.imwrite(str(file.with_suffix(".tiff")), metres.astype(np.float32))
         (source / "depth.txt").write_text((source / "depth.txt").read_text().replace(".png", ".tiff"))
     done = gavo("run", source, *camera, "--depth-scale", 1.5 * units, "--output", out, *FAST)
     told = re.search(
