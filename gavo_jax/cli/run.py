@@ -123,9 +123,8 @@ def _doubts(trajectory: Trajectory, truth: Trajectory, units: float) -> Iterator
     if is_w_first(truth, trajectory):
         yield "The ground truth agrees only if its quaternions are read as w x y z; write them as x y z w."
     if size := relative_size(trajectory, truth):
-        yield f"The trajectory has {size:.3g} times the size of the ground truth. It would agree if depth had " + (
-            f"{size * units:.4g} units per metre (--depth-scale), not {units:g}."
-        )
+        unit = f"{size * units:.4g} units per metre (--depth-scale), not {units:g}"
+        yield f"The trajectory has {size:.3g} times the size of the ground truth. It would agree if depth had {unit}."
 
 
 def _start(options: Run, sequence: Sequence, folder: RunFolder, config: dict[str, Any]) -> None:

@@ -163,9 +163,14 @@ def half_body() -> Seen:
     return Seen(1, field.astype(np.float32), 0.5, np.zeros(3))
 
 
+def half_upside_down(depth: np.ndarray) -> np.ndarray:
+    """Depth that is wrong where that body is."""
+    return np.where(np.arange(160) < 80, np.flipud(depth), depth)
+
+
 def test_depth_where_a_body_moves_says_nothing() -> None:
     body = half_body()
-    halves = [replace(f, depth=np.where(np.arange(160) < 80, np.flipud(f.depth), f.depth)) for f in room()[0]]
+    halves = [replace(f, depth=half_upside_down(f.depth)) for f in room()[0]]
     assert not is_unexplained(halves, (body,)) and is_unexplained(halves)
     assert is_unexplained([replace(f, depth=np.flipud(f.depth)) for f in room()[0]], (body,))
 
@@ -189,7 +194,7 @@ def test_a_body_that_was_found_late_is_why_depth_seemed_wrong(known_from: int, i
             unexplained.append(odometry.progress.depth.change.is_unexplained)
         return any(unexplained)
 
-    assert told(lambda depth: np.where(np.arange(160) < 80, np.flipud(depth), depth)) == is_told
+    assert told(half_upside_down) == is_told
     assert told(np.flipud)
 
 

@@ -41,13 +41,12 @@ def listed_times(path: Path, color: Sequence[Path], depth: Sequence[Path]) -> tu
     except GavoError as fault:
         why = str(fault).removeprefix(f"{file}: ")
         return None, [f"{file.name}: times are not read from it ({why}): name the images by them, or pass --rate"]
-    numbers = sorted(times)
-    seconds = [times[n] for n in numbers]
+    numbers, seconds = list(times), list(times.values())
     return lambda wanted: np.interp(wanted, numbers, seconds), []
 
 
 def _times_of(images: dict[int, Path], rows: list[tuple[str, list[str]]]) -> dict[int, float]:
-    """The time of each image, seconds, by its number.
+    """The time of each image, seconds, by its number, in order.
 
     Raises:
         GavoError: the rows do not give one, or the times do not increase.

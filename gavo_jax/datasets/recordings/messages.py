@@ -74,10 +74,9 @@ INFRARED = re.compile(r"(?:^|[/_])(?:ir|infra|infrared|amplitude|intensity|dispa
 
 def encoding_of(kind: str, message: Any) -> str:
     """The encoding of an image message, as `LAYOUTS` spells it, or the format of a compressed one."""
-    return _spelled(message.encoding) if kind == IMAGE else message.format
-
-
-def _spelled(encoding: str) -> str:
+    if kind != IMAGE:
+        return message.format
+    encoding: str = message.encoding
     return SPELLINGS.get(encoding.lower(), encoding)
 
 
@@ -109,7 +108,7 @@ def color_of(kind: str, message: Any, name: str) -> np.ndarray:
     pixels = _pixels(message, name)
     if pixels.dtype.kind == "f":
         raise FrameError(f"{name}: encoding {message.encoding} is not colour")
-    return _converted(pixels, _spelled(message.encoding), name)
+    return _converted(pixels, encoding_of(kind, message), name)
 
 
 def _mosaic(form: str) -> str | None:
@@ -169,7 +168,7 @@ def _is_inverse(form: str, slope: float) -> bool:
 
 def _pixels(message: Any, name: str) -> np.ndarray:
     """The pixels of a raw image message, not converted, [h, w] or [h, w, channels]."""
-    encoding = _spelled(message.encoding)
+    encoding = encoding_of(IMAGE, message)
     layout = LAYOUTS.get(encoding)
     if layout is None:
         raise FrameError(f"{name}: encoding {message.encoding[:40]!r} is not one of {', '.join(LAYOUTS)}")

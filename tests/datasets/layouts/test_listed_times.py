@@ -13,10 +13,10 @@ STEPS = np.array([0.0, 0.033, 0.1, 0.133])[: len(GREYS)]
 """Times of the frames, seconds: the second gap is that of a dropped frame."""
 
 
-def numbered(folder: Path, name: str = "{:04d}.png") -> Path:
+def folder_of(folder: Path, name: str = "{i:04d}.png") -> Path:
     for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
-        image(folder / "rgb" / name.format(i), grey)
-        image(folder / "depth" / name.format(i), raw(metres, 1000))
+        image(folder / "rgb" / name.format(i=i, t=1000 + i / 15), grey)
+        image(folder / "depth" / name.format(i=i, t=1000 + i / 15), raw(metres, 1000))
     (folder / "camera.toml").write_text(CAMERA_TOML)
     return folder
 
@@ -48,7 +48,7 @@ def rows(form: str, scale: float = 1.0, start: float = 0.0) -> str:
     ],
 )
 def test_frames_have_the_times_of_the_list(tmp_path: Path, name: str, text: str) -> None:
-    numbered(tmp_path)
+    folder_of(tmp_path)
     (tmp_path / name).write_text(text)
     sequence = open_source(tmp_path)
     assert np.allclose(np.asarray(sequence.timestamps) - sequence.timestamps[0], STEPS, atol=2e-6)
@@ -72,7 +72,7 @@ def test_frames_have_the_times_of_the_list(tmp_path: Path, name: str, text: str)
     ],
 )
 def test_a_list_that_is_not_read_is_told(tmp_path: Path, text: str, why: str) -> None:
-    numbered(tmp_path)
+    folder_of(tmp_path)
     (tmp_path / "times.txt").write_text(text)
     sequence = open_source(tmp_path)
     told = f"times.txt: times are not read from it ({why}): name the images by them, or pass --rate"
@@ -81,17 +81,13 @@ def test_a_list_that_is_not_read_is_told(tmp_path: Path, text: str, why: str) ->
 
 
 def test_a_rate_and_names_that_are_times_take_precedence(tmp_path: Path) -> None:
-    (numbered(tmp_path / "a") / "times.txt").write_text(rows("{t:.3f}"))
-    (numbered(tmp_path / "b", "{:04d}.png") / "times.txt").write_bytes(b"\xff\xfe")
+    (folder_of(tmp_path / "a") / "times.txt").write_text(rows("{t:.3f}"))
+    (folder_of(tmp_path / "b") / "times.txt").write_bytes(b"\xff\xfe")
     given = open_source(tmp_path / "a", Reading(rate=10))
     assert given.timestamps[1] - given.timestamps[0] == pytest.approx(0.1)
     assert not getattr(given, "left_out", [])
     assert "not a text file (UTF-8)" in " ".join(open_source(tmp_path / "b").left_out)  # type: ignore[attr-defined]
-    folder = tmp_path / "c"
-    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
-        image(folder / f"rgb/{1000 + i / 15:.6f}.png", grey)
-        image(folder / f"depth/{1000 + i / 15:.6f}.png", raw(metres, 1000))
-    (folder / "camera.toml").write_text(CAMERA_TOML)
+    folder = folder_of(tmp_path / "c", "{t:.6f}.png")
     (folder / "times.txt").write_text(rows("{t:.3f}"))
     named = open_source(folder)
     assert named.timestamps[0] == 1000
