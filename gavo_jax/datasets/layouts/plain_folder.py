@@ -75,7 +75,7 @@ class PlainFolder(FileSequence):
             calibration = calibration.with_depth_of_size(*depth_size_of_most(paired.entries))
         truth, unread = cls.truth(path, paired)
         is_open = paired.seconds is not None and not reading.rate and told is None
-        unread += unread_truth(path, truth, cls.ESTIMATES) + (unread_times if is_open else [])
+        unread += unread_truth(path, truth, cls.ESTIMATES) + (unread_times if paired.seconds else [])
         sequence = cls(root.name, paired.entries, calibration, truth, reading, paired.left_out + others + unread)
         counted = NUMBERS if film is None else BY_FILM
         sequence.times_guessed = counted if is_open else paired.guessed

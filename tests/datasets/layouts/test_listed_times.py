@@ -1,10 +1,11 @@
 """Times of numbered frames that a list beside the images states."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from written_folders import CAMERA_TOML, GREYS, METRES, image, raw
+from written_folders import CAMERA_TOML, GREYS, METRES, image, open3d, raw
 
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.registry import open_source
@@ -92,3 +93,14 @@ def test_a_rate_and_names_that_are_times_take_precedence(tmp_path: Path) -> None
     named = open_source(folder)
     assert named.timestamps[0] == 1000
     assert not getattr(named, "left_out", [])
+
+
+def test_a_list_is_told_beside_a_rate_that_the_source_states(tmp_path: Path) -> None:
+    open3d(tmp_path)
+    file = tmp_path / "camera_intrinsic.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "fps": 15}))
+    (tmp_path / "times.txt").write_text(rows("{i}"))
+    sequence = open_source(tmp_path)
+    assert getattr(sequence, "kind", "") == "Open3D reconstruction folder"
+    assert sequence.timestamps[1] - sequence.timestamps[0] == pytest.approx(1 / 15)
+    assert [line[:9] for line in getattr(sequence, "left_out", [])] == ["times.txt"]
