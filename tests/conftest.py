@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 # JAX reads this when it is imported, so it comes first
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
@@ -123,6 +124,18 @@ def data_dir() -> Path:
     if os.environ.get("GAVO_REQUIRE_DATA"):
         pytest.fail(reason)
     pytest.skip(reason)
+
+
+@pytest.fixture(scope="session")
+def open3d() -> ModuleType:
+    """Return the library that maps need. Skips where it cannot be imported."""
+    from gavo_jax.errors import GavoError
+    from gavo_jax.libusb import import_open3d
+
+    try:
+        return import_open3d("map")
+    except GavoError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,5 @@
-"""A map of a few small frames; where Open3D is not installed, its refusals alone."""
+"""A map of a few small frames; where Open3D cannot be imported, its refusals alone."""
 
-import importlib.util
 import resource
 import sys
 from dataclasses import replace
@@ -32,8 +31,6 @@ from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
 
 FILES = {"a.ply": "cloud", "a.pcd": "cloud", "b.ply": "mesh", "b.obj": "mesh"}
-
-needs_open3d = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="Open3D is not installed")
 
 
 @pytest.mark.parametrize(
@@ -189,8 +186,7 @@ def test_an_empty_map_is_not_written(tmp_path, name):
         nothing.write(tmp_path / name)
 
 
-@needs_open3d
-def test_cloud_and_mesh_lie_on_the_surfaces_that_were_seen(tmp_path):
+def test_cloud_and_mesh_lie_on_the_surfaces_that_were_seen(tmp_path, open3d):
     sequence = SyntheticSequence(4, noise=NONE, camera=CAMERA, color=True)
     poses = sequence.ground_truth.world_T_camera
     builder = MapBuilder(CAMERA, voxel=0.03)
@@ -200,7 +196,6 @@ def test_cloud_and_mesh_lie_on_the_surfaces_that_were_seen(tmp_path):
     v, u = np.nonzero((frame.depth > 0) & (frame.depth < 3.5 * CAMERA.depth_scale))
     seen = CAMERA.back_project(np.stack([u, v], -1).astype(float), frame.depth[v, u] / CAMERA.depth_scale)
     seen = seen @ poses[2][:3, :3].T + poses[2][:3, 3]
-    open3d = import_open3d("map")
     cloud, mesh = builder.extract("cloud"), builder.extract("mesh")
     for scene, reach in ((cloud, 0.02), (mesh, 0.02)):
         tree = open3d.core.nns.NearestNeighborSearch(open3d.core.Tensor(scene.points))
@@ -215,7 +210,7 @@ def test_cloud_and_mesh_lie_on_the_surfaces_that_were_seen(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.pcd", "a.ply", "b.obj", "b.ply"]
 
 
-@needs_open3d
+@pytest.mark.usefixtures("open3d")
 @pytest.mark.parametrize(("name", "share"), [(name, share) for name in FILES for share in (0.1, 0.99)])
 def test_a_full_disk_leaves_no_part_of_a_map(tmp_path, capfd, name, share):
     """Open3D does not notice; its library of PLY says so once for each value, and it goes on."""
@@ -236,13 +231,13 @@ def test_a_full_disk_leaves_no_part_of_a_map(tmp_path, capfd, name, share):
     assert capfd.readouterr() == ("", "")
 
 
-@needs_open3d
+@pytest.mark.usefixtures("open3d")
 def test_nothing_seen_is_an_empty_map():
     sequence = SyntheticSequence(2, noise=NONE, camera=CAMERA)
     assert len(build_map(sequence, [], farthest=0.1).points) == 0
 
 
-@needs_open3d
+@pytest.mark.usefixtures("open3d")
 def test_frames_that_do_not_fit_are_refused_and_no_reading_is_a_surface():
     """Images of another size were fused by the wrong pixels, poses that are not-a-number counted, the number of 16 bits
     that stands for no reading was a wall, and another shape was taken for a mesh.
@@ -274,7 +269,7 @@ def wall(metres: float, voxel: float, missing: slice = slice(0)) -> SceneMap:
     return builder.extract()
 
 
-@needs_open3d
+@pytest.mark.usefixtures("open3d")
 @pytest.mark.parametrize("row", [0, 3])
 def test_a_map_does_not_need_the_rows_that_are_looked_at(row):
     """Open3D looks at every fourth row for the blocks of a frame: where all of those were empty it raised an error."""
@@ -282,7 +277,7 @@ def test_a_map_does_not_need_the_rows_that_are_looked_at(row):
     assert len(points) > 100 and np.abs(points[:, 2] - 2.02).max() < 0.05
 
 
-@needs_open3d
+@pytest.mark.usefixtures("open3d")
 @pytest.mark.parametrize("voxel", [0.02, 0.005])
 def test_small_voxels_leave_no_holes(voxel: float) -> None:
     """A third of the wall was missing, without a word, where blocks are smaller than four pixels."""
@@ -294,14 +289,14 @@ def test_small_voxels_leave_no_holes(voxel: float) -> None:
     assert len(np.unique(cells, axis=0)) > 0.95 * np.prod(size)
 
 
-@needs_open3d
+@pytest.mark.usefixtures("open3d")
 def test_a_wall_that_lies_on_the_voxels_is_seen() -> None:
     """It had no side, and the map was empty."""
     points = wall(2.0, 0.05).points
     assert len(points) > 100 and np.abs(points[:, 2] - 2.0).max() < 1e-3
 
 
-@needs_open3d
+@pytest.mark.usefixtures("open3d")
 def test_a_full_map_keeps_what_is_near(monkeypatch) -> None:
     """The first frame that went beyond was left out as a whole."""
     far = np.linalg.norm(wall(2.01, 0.02).points, axis=1).max()

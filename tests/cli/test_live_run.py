@@ -21,7 +21,6 @@ from gavo_jax.odometry.run import run_odometry
 from gavo_jax.scene_map import build_map
 from gavo_jax.trajectory import Trajectory
 
-needs_open3d = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="Open3D is not installed")
 WIDE = replace(CAMERA, width=320)
 LENS = replace(CAMERA, distortion=(0.1, -0.1, 0.0, 0.0, 0.0))
 FRAMES = SyntheticSequence(5, noise=NONE, camera=CAMERA, color=True)
@@ -140,7 +139,7 @@ def test_a_live_run_can_be_watched_and_its_options_count(tmp_path, capsys, monke
     assert [odometry[name] for name in ("bodies", "on_lost", "reference")] == ["off", "predict", "previous"]
 
 
-@needs_open3d
+@pytest.mark.usefixtures("open3d")
 def test_the_map_of_a_live_run_is_that_of_its_frames(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("gavo_jax.cli.live.Newest", Unhurried)
     register_device("player", Player)
