@@ -323,7 +323,8 @@ def build_map(
     """
     check_shape(shape)
     require_sequence(sequence)
-    frames, steps = AsTracked(sequence), list(steps)
+    steps = list(steps)
+    frames = AsTracked(sequence, steps)
     corrected = _PosesInOrder(trajectory, float(sequence.timestamps[0]))
     places: list[tuple[int, Step | None, np.ndarray, int]] = [(0, None, np.eye(4), 0)]
     reasons: Counter[str] = Counter()

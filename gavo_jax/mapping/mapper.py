@@ -158,7 +158,7 @@ class Mapper:
             moving: Where bodies are in the frame of a step.
             is_drawn_on: Whether overlays are drawn into the images: then all of them are decoded, to find these again.
         """
-        frames = AsTracked(sequence, is_drawn_on)
+        frames = AsTracked(sequence, steps, is_drawn_on)
         self.watch(_decoded(frames, 0), None)
         last = max((step.index for step in steps if _may_be_keyframe(step)), default=0)
         for step in steps:

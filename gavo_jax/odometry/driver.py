@@ -5,7 +5,7 @@ It checks each frame, has an aligner find its motion, decides what becomes of th
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, Protocol
 
 import jax
@@ -217,8 +217,9 @@ class Odometry:
         stopwatch = Stopwatch()
         overlays, self.frame = self.progress.overlays, None
         if isinstance(frame, Frame):
-            overlays = overlays.after(frame.grey)
-            self.frame = frame = overlays.without(frame)
+            overlays = overlays.after(frame.grey, self.progress.world_T_camera)
+            self.frame = overlays.without(frame)
+            frame = replace(self.frame, depth=frame.depth)  # no fault of the sensor's
         finding, history = check_frame(frame, timestamp, self.camera, self.progress.history)
         before = self.progress._replace(last_index=self.progress.last_index + 1, history=history, overlays=overlays)
         usable = self.frame if finding.use is not Use.NOTHING else None

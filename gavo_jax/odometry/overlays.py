@@ -1,12 +1,13 @@
-"""Overlays that are drawn into every image of a run: a clock, a name, a frame around it.
+"""Overlays: what is drawn into every image of a run (a clock, a name, a frame around it), or attached to the camera.
 
-An overlay stays put as the scene moves, and would hold the camera where it is. It is told by its lack of noise: no
-sensor gives a pixel the same level for long.
+An overlay stays put as the scene moves, and would hold the camera where it is. A drawing is told by its lack of noise:
+no sensor gives a pixel the same level for long. `attached` tells the rest.
 """
 
 import contextlib
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -14,6 +15,10 @@ from jaxtyping import Num, UInt8
 
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.rectified import rectified_at
+from gavo_jax.odometry.attached import Attached
+
+if TYPE_CHECKING:
+    from gavo_jax.odometry.driver import Step
 
 STEP = 2
 """Spacing of the sampled pixels, down and to the right."""
@@ -40,25 +45,33 @@ class Overlays(NamedTuple):
     """The last image; None before the first."""
     counts: UInt8[np.ndarray, "h w"] = np.zeros((0, 0), np.uint8)
     """Number of images of a moving camera, up to the last one, in which each pixel kept its level."""
+    attached: Attached = Attached()
+    """What is known of parts of the camera's carrier."""
+
+    @property
+    def is_drawn(self) -> bool:
+        """Whether enough of the image keeps its level for something to be drawn there."""
+        return self.counts.size > 0 and bool(np.mean(self.counts >= FRAMES) >= MIN_OVERLAY_SHARE)
 
     @property
     def is_any(self) -> bool:
-        """Whether enough of the image keeps its level for an overlay to be there."""
-        return self.counts.size > 0 and bool(np.mean(self.counts >= FRAMES) >= MIN_OVERLAY_SHARE)
+        """Whether there is an overlay of either kind."""
+        return self.is_drawn or bool(self.attached.edges.any())
 
-    def after(self, grey: np.ndarray) -> Self:
-        """Update with one more image."""
+    def after(self, grey: np.ndarray, world_T_camera: np.ndarray) -> Self:
+        """Update with one more image, and the camera's pose at the one before."""
         some = np.ascontiguousarray(np.asarray(grey)[::STEP, ::STEP])
         if some.dtype != np.uint8:
             some = np.clip(np.nan_to_num(some.astype(np.float64)), 0.0, 255.0).astype(np.float32)
+        attached = self.attached.after(some, world_T_camera)
         if self.last is None or (self.last.shape, self.last.dtype) != (some.shape, some.dtype):
-            return self._replace(last=some, counts=np.zeros(some.shape, np.uint8))
+            return self._replace(last=some, counts=np.zeros(some.shape, np.uint8), attached=attached)
         change = cv2.absdiff(some, self.last)
         seen = change[::STEP, ::STEP][_is_steep(some)[::STEP, ::STEP]]
         if not seen.size or np.mean(seen > CHANGED) < MOVED:
-            return self._replace(last=some)
+            return self._replace(last=some, attached=attached)
         counts = np.where(change == 0, np.minimum(self.counts, FRAMES) + np.uint8(1), np.uint8(0))
-        return self._replace(last=some, counts=counts)
+        return self._replace(last=some, counts=counts, attached=attached)
 
     def without(self, frame: Frame) -> Frame:
         """The last frame with overlays replaced by the mean of their surroundings, and without depth there."""
@@ -66,6 +79,13 @@ class Overlays(NamedTuple):
             return frame
         edges = (self.counts >= FRAMES) & _is_steep(self.last)
         if np.count_nonzero(edges) < MIN_OVERLAY_SHARE * edges.size:
+            edges[:] = False
+        if self.attached.edges.any():
+            attached = cv2.resize(
+                self.attached.edges.astype(np.uint8), edges.shape[::-1], interpolation=cv2.INTER_NEAREST
+            )
+            edges |= attached > 0
+        if not edges.any():
             return frame
         drawn = cv2.dilate(edges.astype(np.uint8), np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)) > 0
         grey, depth = np.asarray(frame.grey), np.asarray(frame.depth)
@@ -85,9 +105,10 @@ class AsTracked:
     Without `is_drawn_on` there are no overlays, and only the frames that are asked for are decoded.
     """
 
-    def __init__(self, sequence: Sequence, is_drawn_on: bool = True) -> None:
+    def __init__(self, sequence: Sequence, steps: Iterable["Step"], is_drawn_on: bool = True) -> None:
         self._sequence, self._is_drawn_on = sequence, is_drawn_on
-        self._overlays, self._next = Overlays(), 0
+        self._poses = {step.index: step.world_T_camera for step in steps}
+        self._overlays, self._next, self._pose = Overlays(), 0, np.eye(4)
 
     def __getitem__(self, index: int) -> Frame:
         """A frame after those that were asked for before, without distortion and overlays.
@@ -97,13 +118,17 @@ class AsTracked:
         """
         for number in range(self._next, index) if self._is_drawn_on else ():
             with contextlib.suppress(FrameError):
-                self._overlays = self._overlays.after(rectified_at(self._sequence, number).grey)
+                self._look_at(rectified_at(self._sequence, number), number)
         self._next = index + 1
         frame = rectified_at(self._sequence, index)
         if not self._is_drawn_on:
             return frame
-        self._overlays = self._overlays.after(frame.grey)
+        self._look_at(frame, index)
         return self._overlays.without(frame)
+
+    def _look_at(self, frame: Frame, index: int) -> None:
+        self._pose = self._poses.get(index - 1, self._pose)
+        self._overlays = self._overlays.after(frame.grey, self._pose)
 
 
 def _is_steep(image: np.ndarray) -> np.ndarray:

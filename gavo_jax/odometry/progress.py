@@ -53,7 +53,7 @@ class Progress(NamedTuple):
     depth: DepthWatch | None = None
     """What is known of the reference's depth, and how depth has changed; None before the first reference."""
     overlays: Overlays = Overlays()
-    """Overlays drawn into every image."""
+    """What stays put in every image."""
 
     def tracker_at(self, timestamp: float) -> Any:
         """The aligner's state for a frame at a timestamp, with the motion predicted from the way so far."""

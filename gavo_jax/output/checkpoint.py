@@ -17,6 +17,7 @@ from gavo_jax.camera import MAX_SIDE
 from gavo_jax.depth_edges import DepthEdges
 from gavo_jax.errors import GavoError, write_bytes
 from gavo_jax.frame_checks import History
+from gavo_jax.odometry.attached import Attached
 from gavo_jax.odometry.beginnings import Beginning
 from gavo_jax.odometry.depth_change import DepthChange
 from gavo_jax.odometry.depth_watch import DepthWatch
@@ -28,8 +29,8 @@ from gavo_jax.odometry.way import Fix, Way
 
 NUMBERS, SEAL, POSES = "numbers", "seal", ("world_T_reference", "world_T_camera")
 INVERSE_DEPTH, EDGES = "inverse_depth", "depth_edges"
-LAST_GREY, SAME_LEVEL = "last_grey", "same_level"
-MOST_BESIDE = 2**20 + 5 * MAX_SIDE**2 // 4
+LAST_GREY, SAME_LEVEL, ATTACHED = "last_grey", "same_level", "attached_"
+MOST_BESIDE = 2**21 + 5 * MAX_SIDE**2 // 4
 """Maximum bytes without the tracker: numbers, and a float and a count for one pixel in four of the largest image."""
 
 
@@ -90,6 +91,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         arrays |= {INVERSE_DEPTH: watch.change.inverse, EDGES: watch.edges.sums}
     if progress.overlays.last is not None:
         arrays |= {LAST_GREY: progress.overlays.last, SAME_LEVEL: progress.overlays.counts}
+        arrays |= {ATTACHED + name: np.asarray(part) for name, part in progress.overlays.attached._asdict().items()}
     data = io.BytesIO()
     arrays[SEAL] = np.array(_seal(arrays))
     np.savez(data, **arrays)  # pyright: ignore[reportArgumentType] (NumPy 2.0 takes allow_pickle=False for an array)
@@ -153,7 +155,11 @@ def _progress_of(numbers: dict[str, Any], arrays: dict[str, np.ndarray]) -> Prog
         (delay, *known), seen, told = depth
         change = DepthChange(arrays[INVERSE_DEPTH], delay, *map(tuple, known))
         numbers["depth"] = DepthWatch(change, DepthEdges(arrays[EDGES], *seen), told)
-    overlays = Overlays(arrays[LAST_GREY], arrays[SAME_LEVEL]) if LAST_GREY in arrays else Overlays()
+    overlays = Overlays()
+    if LAST_GREY in arrays:
+        parts = {name: arrays[ATTACHED + name] for name in Attached._fields}
+        attached = Attached(**{**parts, "moves": int(parts["moves"])})
+        overlays = Overlays(arrays[LAST_GREY], arrays[SAME_LEVEL], attached)
     poses: dict[str, Any] = {name: arrays[name] for name in POSES}
     return Progress(**numbers, **poses, overlays=overlays)
 

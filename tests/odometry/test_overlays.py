@@ -33,7 +33,7 @@ def marked(_: int, frame: Frame) -> Frame:
 def seen(frames: Iterable[Frame]) -> Overlays:
     overlays = Overlays()
     for frame in frames:
-        overlays = overlays.after(frame.grey)
+        overlays = overlays.after(frame.grey, np.eye(4))
     return overlays
 
 
@@ -55,7 +55,7 @@ def test_what_is_drawn_loses_its_edges_and_its_depth_and_nothing_else_does() -> 
 def test_a_scene_is_not_taken_for_a_drawing(noise: SensorNoise, speed: float) -> None:
     overlays = Overlays()
     for frame in Rendered(30, camera=small.CAMERA, noise=noise, speed=speed):
-        overlays = overlays.after(frame.grey)
+        overlays = overlays.after(frame.grey, np.eye(4))
         assert overlays.without(frame) is frame
 
 
@@ -68,7 +68,7 @@ def test_a_camera_that_stands_still_draws_nothing() -> None:
 def test_another_size_begins_anew() -> None:
     overlays = seen(marked(i, frame) for i, frame in enumerate(ROOM))
     small_image = Rendered(1, camera=small.CAMERA.level(1))[0]
-    assert overlays.after(small_image.grey).without(small_image) is small_image
+    assert overlays.after(small_image.grey, np.eye(4)).without(small_image) is small_image
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64, np.int32])
@@ -83,7 +83,7 @@ def test_an_image_without_levels_is_looked_at_without_a_word() -> None:
     images = [np.full((40, 60), value) for value in (np.inf, -np.inf, np.nan, 3e38, -1.0, 7)]
     overlays = Overlays()
     for image in (*images, *images[::-1], *(image.astype(np.uint8) for image in images[-1:])):
-        overlays = overlays.after(image)
+        overlays = overlays.after(image, np.eye(4))
     assert not np.any(overlays.counts)
 
 
@@ -139,15 +139,14 @@ def test_frames_are_read_again_as_they_were_tracked() -> None:
     def watch(frame: Frame | None, step: Step | None) -> None:
         shown[0 if step is None else step.index] = frame
 
-    for _ in track(sequence, SEARCH_ALONE, watch=watch):
-        pass
-    again, plain = AsTracked(sequence), AsTracked(sequence, is_drawn_on=False)
+    steps = [*track(sequence, SEARCH_ALONE, watch=watch)]
+    again, plain = AsTracked(sequence, steps), AsTracked(sequence, steps, is_drawn_on=False)
     for index in (0, 3, FRAMES + 2, len(ROOM) - 1):
         np.testing.assert_array_equal(again[index].grey, shown[index].grey)
         np.testing.assert_array_equal(again[index].depth, shown[index].depth)
         np.testing.assert_array_equal(plain[index].grey, sequence[index].grey)
     with pytest.raises(FrameError, match="torn"):
-        AsTracked(sequence)[4]
+        AsTracked(sequence, steps)[4]
 
 
 def test_a_resumed_run_makes_its_map_of_what_was_tracked(monkeypatch: pytest.MonkeyPatch) -> None:

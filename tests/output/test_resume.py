@@ -452,6 +452,6 @@ def test_killed_at_twenty_random_moments(clip, tmp_path, method):
 
 def test_a_checkpoint_of_large_images_can_be_read(tmp_path: Path) -> None:
     """From 1920x1080 on each was larger than was allowed."""
-    overlays = Overlays().after(np.zeros((1080, 1920), np.float32))
+    overlays = Overlays().after(np.zeros((1080, 1920), np.float32), np.eye(4))
     save_checkpoint(tmp_path / "checkpoint.npz", Checkpoint(Progress()._replace(overlays=overlays), {}))
     assert load_checkpoint(tmp_path / "checkpoint.npz", ()).progress.overlays.last is not None
