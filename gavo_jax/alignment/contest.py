@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Integer
 
 from gavo_jax.alignment.evidence import Evidence
 from gavo_jax.alignment.modes import rival_error
@@ -19,6 +19,10 @@ LEAST_EVIDENCE = 0.02
 KNOWN, FOUND, ALIASES, WINNER = range(4)
 """Rounds: motions known beforehand, those that a search finds, the aliases of the best of both on a repetitive pattern,
 and the best of all on the finest level."""
+CLOSE = 0.9
+"""Ratio of a motion's evidence to the largest above which both are even. Then the points that each sees decide: a plain
+wall matches itself anywhere, so a smaller motion, which keeps more of it in view, has more evidence but is no better.
+"""
 LEAST_RIVAL = 0.5
 """Ratio of a mode's evidence to the winner's above which it is a rival."""
 
@@ -109,9 +113,17 @@ def _competing(rows: Entry) -> Entry:
 
 
 def _best(rows: Entry) -> Entry:
-    """Return the entry with the most evidence."""
+    """Return the entry that wins."""
     entries = _competing(rows)
-    return jax.tree.map(lambda leaf: leaf[jnp.argmax(entries.evidence.total)], entries)
+    winner = _winner(entries.evidence)
+    return jax.tree.map(lambda leaf: leaf[winner], entries)
+
+
+def _winner(of: Evidence) -> Integer[Array, ""]:
+    """Return the number of the entry with the most evidence; among even ones, over the points that each sees."""
+    most = jnp.max(of.total)
+    even = of.total >= jnp.where(most > 0, CLOSE * most, most)
+    return jnp.argmax(jnp.where(even, of.seen, -jnp.inf))
 
 
 def _lead(rows: Entry) -> Float[Array, ""]:
@@ -119,8 +131,8 @@ def _lead(rows: Entry) -> Float[Array, ""]:
 
     Only the points that each sees count, as a larger overlap alone makes no motion better.
     """
-    motions, (total, seen), _ = _competing(rows)
-    winner = jnp.argmax(total)
+    motions, of, _ = _competing(rows)
+    (total, seen), winner = of, _winner(of)
     is_rival = total >= LEAST_RIVAL * total[winner]
     costs = jnp.where(is_rival, 1.0 / jnp.maximum(seen, LEAST_EVIDENCE), jnp.inf)
     return seen[winner] * rival_error(motions, costs, winner)

@@ -55,6 +55,15 @@ def test_what_most_speaks_for_wins() -> None:
     assert searched == 1.0
 
 
+@pytest.mark.parametrize(("more", "wins"), [(2.9, 0.3), (3.2, 0.0)])
+def test_among_even_motions_the_points_seen_decide(more: float, wins: float) -> None:
+    """A plain wall matched itself: a smaller motion that kept more of it in view won over the true one, by 4 %."""
+    peaks = [Peak(0.0, more, 3.4), Peak(0.3, 2.8, 3.9)]
+    winner, lead, _ = contest(sideways(0.0, 0.3), sideways(0.6), peaks)
+    assert winner.motion[0, 3] == pytest.approx(wins)
+    assert lead == pytest.approx(3.9 / 3.4 if wins else 3.4 / 3.9, rel=1e-3)
+
+
 def test_what_is_known_is_not_enough_where_the_points_seen_match_badly() -> None:
     _, _, searched = contest(sideways(0.5), sideways(0.3), [Peak(0.3, 0.5, 1.0), Peak(0.5, 2.0, 2.5)])
     assert searched == 1.0
