@@ -132,7 +132,7 @@ def _lead(rows: Entry) -> Float[Array, ""]:
     Only the points that each sees count, as a larger overlap alone makes no motion better.
     """
     motions, of, _ = _competing(rows)
-    (total, seen), winner = of, _winner(of)
-    is_rival = total >= LEAST_RIVAL * total[winner]
-    costs = jnp.where(is_rival, 1.0 / jnp.maximum(seen, LEAST_EVIDENCE), jnp.inf)
-    return seen[winner] * rival_error(motions, costs, winner)
+    winner = _winner(of)
+    is_rival = of.total >= LEAST_RIVAL * of.total[winner]
+    costs = jnp.where(is_rival, 1.0 / jnp.maximum(of.seen, LEAST_EVIDENCE), jnp.inf)
+    return of.seen[winner] * rival_error(motions, costs, winner)

@@ -13,6 +13,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from gavo_jax.rigid_motions import length_and_angle
+from gavo_jax.trajectory import inverse
+
 SIDE = 160
 """Pixels, about, along the longer side of the images that are compared."""
 SLOPE = 2.0
@@ -109,9 +112,8 @@ def _blurred(grey: np.ndarray) -> Float[np.ndarray, "h w"]:
 
 def _motion(world_T_a: np.ndarray, world_T_b: np.ndarray) -> float:
     """Angle in radians plus distance in metres between two poses."""
-    turned = world_T_a[:3, :3].T @ world_T_b[:3, :3]
-    angle = np.arccos(np.clip((np.trace(turned) - 1.0) / 2.0, -1.0, 1.0))
-    return float(angle + np.linalg.norm(world_T_a[:3, 3] - world_T_b[:3, 3]))
+    length, angle = length_and_angle(inverse(world_T_a) @ world_T_b)
+    return float(length + angle)
 
 
 def _steady_edges(

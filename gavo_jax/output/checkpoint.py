@@ -31,7 +31,9 @@ NUMBERS, SEAL, POSES = "numbers", "seal", ("world_T_reference", "world_T_camera"
 INVERSE_DEPTH, EDGES = "inverse_depth", "depth_edges"
 LAST_GREY, SAME_LEVEL, ATTACHED = "last_grey", "same_level", "attached_"
 MOST_BESIDE = 2**21 + 5 * MAX_SIDE**2 // 4
-"""Maximum bytes without the tracker: numbers, and a float and a count for one pixel in four of the largest image."""
+"""Maximum bytes without the tracker: numbers, small images of parts in view, and a float and a count for one pixel in
+four of the largest image.
+"""
 
 
 class Mark(NamedTuple):
