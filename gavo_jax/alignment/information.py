@@ -24,6 +24,11 @@ SIGNIFICANCE = 4.0
 MIN_ALIGNED_SHARE = 1e-3
 """Mean squared cosine between image gradients and a direction's flow below which its information counts as none.
 Interpolated gradients are wrong by two or three per cent, so that a stripe seems to constrain motion along itself."""
+BY_MANY = 20.0
+"""The same for tempered information, in which no point counts much more than others: 400 points have to agree. The few
+steepest points may hold most of the information, whose variance then hides what all the others tell. Fewer points, as
+along the edges of a plain corridor, do not show how far they can be trusted.
+"""
 SAMPLED_POINTS = 4800
 """Number of evenly spread points that the information is taken from if there are twice as many or more."""
 MIN_INFORMATION = 0.01
@@ -81,11 +86,19 @@ def measure_information(problem: Problem, r: Residuals, terms: list[Term], is_bo
     values, turn = jnp.linalg.eigh(directions.T @ sum(products) @ directions)
     directions = directions @ turn
     told = jnp.stack([jnp.sum(directions * (product @ directions), axis=0) for product in products])
-    variances = [jnp.sum((weight * (directions.T @ a) * (directions.T @ b)) ** 2, axis=1) for weight, a, b in noise]
-    variance = jnp.stack(variances)
+    parts = [weight * (directions.T @ a) * (directions.T @ b) for weight, a, b in noise]
+    variance = jnp.stack([jnp.sum(part**2, axis=1) for part in parts])
     is_told = values > SIGNIFICANCE * jnp.sqrt(jnp.sum(variance, axis=0))
+    is_told |= _is_told_by_many(parts[0])
     is_told |= is_body & jnp.any(told > SIGNIFICANCE * jnp.sqrt(variance), axis=0)
     return Information(directions, values, is_told & (values > MIN_ALIGNED_SHARE))
+
+
+def _is_told_by_many(products: Float[Array, "6 n"]) -> Bool[Array, " 6"]:
+    """Whether products of grey gradients add up when they are tempered, so that each counts at most as one."""
+    usual = jnp.mean(jnp.sqrt(jnp.abs(products)), axis=1, keepdims=True) ** 2
+    tempered = products / (jnp.abs(products) + usual + 1e-30)
+    return jnp.sum(tempered, axis=1) > BY_MANY * jnp.sqrt(jnp.sum(tempered**2, axis=1))
 
 
 def _slopes(reference: Reference, r: Residuals, use_depth: bool) -> list[tuple[Slopes, Slopes]]:

@@ -84,6 +84,17 @@ def test_a_texture_in_both_directions_is_enough(noise: float, kinect: bool) -> N
     np.testing.assert_allclose(result.target_T_reference[:2, 3], -SLIDE, atol=1e-3)
 
 
+def test_few_steep_points_do_not_hide_what_all_others_tell() -> None:
+    """The outline of a bright picture holds most of the information; a weak texture is everywhere."""
+
+    def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.where((np.abs(x - 0.05) < 0.04) & (np.abs(y) < 0.04), 250.0, 110 + 0.06 * (waves(x) + waves(y) - 256))
+
+    result = slid(texture, 2.0, True)
+    assert result.status is AlignmentStatus.OK
+    np.testing.assert_allclose(result.target_T_reference[:2, 3], -SLIDE, atol=2e-3)
+
+
 @pytest.mark.parametrize("name", WALLS)
 def test_the_same_image_twice_tells_no_more(name: str) -> None:
     view = photograph(WALLS[name][0], 0 * SLIDE, 0.0, False, 0)
