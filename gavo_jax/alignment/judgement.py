@@ -50,9 +50,11 @@ UNDETERMINED = 0.5
 """Metres or radians: the standard deviation that stands for an undetermined direction."""
 UNKNOWN = np.diag(np.full(6, UNDETERMINED**2, np.float32))
 """Covariance of a motion that the images do not determine at all."""
+LAST_STEPS, CONVERGED = 8, 0.003
+"""Maximum number of last steps, and the share by which one has to lower E for another one to follow."""
 LARGEST_STEP = 0.01
-"""Metres or radians: a larger last step is not taken. It would leave the basin that the search ended in, or follow a
-direction that the images leave undetermined."""
+"""Metres or radians: a larger last step is shortened to this, and taken only if E falls. It may follow a direction that
+the images leave undetermined."""
 
 
 class Part(NamedTuple):
@@ -139,8 +141,7 @@ def _last_step(
     """
 
     def without_sway() -> Swayed:
-        refined = _newton_step(problem, residuals)
-        return unswayed(refined, problem.objective.residuals(refined))
+        return unswayed(*_newton_steps(problem, residuals))
 
     if swaying is None or problem.objective.readout is None:
         found = without_sway()
@@ -150,16 +151,31 @@ def _last_step(
     return replace(problem.with_sway(found.twist), origin=found.motion), found.residuals, found.covariance
 
 
-def _newton_step(problem: Problem, residuals: Residuals) -> Float[Array, "4 4"]:
-    """Return the motion one Newton step from the problem's origin, given its residuals; the origin if that is worse."""
-    model = problem.linearize_residuals(residuals)
-    step = -jnp.linalg.solve(_regular(model.hessian), model.gradient)
-    stepped = problem.origin @ exp(step)
-    error, _ = problem.objective.error(stepped)
-    better = (error < model.error * (1.0 + LARGEST_RISE)) & jnp.all(jnp.abs(step) < LARGEST_STEP)
-    better &= ~problem.is_out_of_reach(stepped)
-    # a barrier, or XLA would carry both motions through all that follows
-    return jax.lax.optimization_barrier(jnp.where(better, stepped, problem.origin))
+def _newton_steps(problem: Problem, residuals: Residuals) -> tuple[Float[Array, "4 4"], Residuals]:
+    """Return the motion some Newton steps from the problem's origin, given its residuals, and those of that motion.
+
+    A single step is enough near the minimum. A search may end far from it where E hardly depends on a direction, so
+    steps follow each other as long as E falls.
+    """
+
+    def step_on(now: tuple[jax.Array, Residuals, jax.Array]) -> tuple[jax.Array, Residuals, jax.Array]:
+        motion, residuals, left = now
+        here = replace(problem, origin=motion)
+        model = here.linearize_residuals(residuals)
+        step = -jnp.linalg.solve(_regular(model.hessian), model.gradient)
+        shortened = jnp.minimum(LARGEST_STEP / jnp.max(jnp.abs(step)), 1.0)
+        stepped = motion @ exp(shortened * step)
+        after = problem.objective.residuals(stepped)
+        error, _ = problem.objective.error_of(after)
+        falls = error < model.error * (1.0 - CONVERGED)
+        better = falls | ((shortened == 1.0) & (error < model.error * (1.0 + LARGEST_RISE)))
+        better &= ~problem.is_out_of_reach(stepped)
+        kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), (stepped, after), (motion, residuals))
+        return *kept, jnp.where(better & falls, left - 1, 0)
+
+    start = problem.origin, residuals, jnp.int32(LAST_STEPS)
+    motion, residuals, _ = jax.lax.while_loop(lambda now: now[2] > 0, step_on, start)
+    return motion, residuals
 
 
 class Examination(NamedTuple):

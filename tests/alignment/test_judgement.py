@@ -36,6 +36,14 @@ def test_a_last_step_centres_what_a_short_search_leaves(sequence: SyntheticSeque
     assert np.all(np.array(error) <= 1.003 * np.array(error_before))
 
 
+def test_last_steps_reach_the_minimum_from_far(sequence: SyntheticSequence, frames: dict[int, Frame]) -> None:
+    """A search of two generations a level ends some 5 mm off, and a single step a millimetre."""
+    settings = Settings(GeneticAlgorithm(population=16, iterations=(0, 2, 2, 2, 2)), AlignmentOptions())
+    found = [align(frames[0], frames[1], sequence.camera, settings, key=jax.random.key(k)) for k in range(5)]
+    truth = target_T_reference(sequence, 0, 1)
+    assert np.median([difference(one.target_T_reference, truth)[0] for one in found]) < 5e-4
+
+
 @pytest.mark.parametrize(
     ("scale", "asked", "status"),
     [
