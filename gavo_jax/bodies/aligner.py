@@ -50,6 +50,8 @@ LARGE = 0.25
 """Share of the image covered by bodies above which the last motion may stand in for one that is not found."""
 MAX_SECONDS_EXTRAPOLATED = 0.5
 """Longest time, in seconds, for which the last motion may stand in for one that is not found."""
+MISSED = 2.5
+"""Ratio of a motion's duration to the last one's above which frames were lost in between."""
 NEARLY_AS_GOOD = 0.85
 """Support of another motion, relative to the best one's, above which it may be the camera's as well."""
 SUSPICIOUS = 0.02
@@ -73,9 +75,7 @@ ACCEPTABLE = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR, AlignmentStatus.DE
 EXCUSED = bit(AlignmentStatus.HIGH_ERROR) | bit(AlignmentStatus.DEPTH_MISMATCH)
 """Findings that a body may cause by occluding points."""
 MIN_DEPTH_AGREEMENT = 0.9
-"""Part of the image that neither moves nor is hidden whose depth has to agree with a motion for `DEPTH_MISMATCH` to
-be excused.
-"""
+"""Part of what neither moves nor is hidden whose depth has to agree for `DEPTH_MISMATCH` to be excused."""
 
 
 class MotionCandidate(NamedTuple):
@@ -184,7 +184,8 @@ class BodyAware:
         The time is in seconds; 0 where a motion was found.
         """
         attempt, before = self._share_out(state, frame, clock, seen), state.scene.seconds_extrapolated
-        if attempt.usable or not before < MAX_SECONDS_EXTRAPOLATED:
+        has_missed = float(clock.elapsed) > MISSED * float(state.tracker.seconds)
+        if attempt.usable or has_missed or not before < MAX_SECONDS_EXTRAPOLATED:
             return attempt, 0.0
         covered = float(np.mean(np.asarray(state.scene.tracks.labels) > 0))
         helped = self._helped_by_prediction(state, clock, attempt, covered)

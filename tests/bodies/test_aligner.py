@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -194,6 +195,23 @@ def test_a_motion_that_more_of_the_image_contradicts_may_be_a_bodys(
     """Dirt on the lens over a third of the image was followed, and `ok`."""
     result = judged(AlignmentStatus.OK, grey=0.8, depth=0.9, support=support, contradicted=contradicted)
     assert result.status is status
+
+
+@pytest.mark.parametrize(("lost", "is_guessed"), [(0, True), (10, False)])
+def test_the_last_motion_does_not_stand_in_for_frames_that_were_lost(
+    monkeypatch: pytest.MonkeyPatch, lost: int, is_guessed: bool
+) -> None:
+    """A camera that was covered and carried elsewhere went on in the same world, by the last motion before that."""
+    missing = Attempt(None, no_alignment(AlignmentStatus.HIGH_ERROR), usable=False)
+    guess = missing._replace(usable=True)
+    monkeypatch.setattr(BodyAware, "_share_out", lambda *_: missing)
+    monkeypatch.setattr(BodyAware, "_helped_by_prediction", lambda *_: guess)
+    scene = SimpleNamespace(seconds_extrapolated=0.0, tracks=SimpleNamespace(labels=np.ones((6, 8))))
+    state: Any = SimpleNamespace(tracker=SimpleNamespace(seconds=1 / 30), scene=scene)
+    nothing: Any = None
+    clock: Any = SimpleNamespace(elapsed=(lost + 1) / 30)
+    attempt, _ = BodyAware(nothing, nothing)._asked(state, nothing, clock, missing)
+    assert attempt is (guess if is_guessed else missing)
 
 
 def test_points_that_are_left_out_are_not_asked_for() -> None:
