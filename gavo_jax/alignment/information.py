@@ -21,14 +21,14 @@ from gavo_jax.objective.problem import Problem
 
 SIGNIFICANCE = 4.0
 """Number of standard deviations of noise alone below which a direction's information counts as none."""
-MIN_ALIGNED_SHARE = 1e-3
-"""Mean squared cosine between image gradients and a direction's flow below which its information counts as none.
-Interpolated gradients are wrong by two or three per cent, so that a stripe seems to constrain motion along itself."""
 BY_MANY = 20.0
 """The same for tempered information, in which no point counts much more than others: 400 points have to agree. The few
 steepest points may hold most of the information, whose variance then hides what all the others tell. Fewer points, as
 along the edges of a plain corridor, do not show how far they can be trusted.
 """
+MIN_ALIGNED_SHARE = 1e-3
+"""Mean squared cosine between image gradients and a direction's flow below which its information counts as none.
+Interpolated gradients are wrong by two or three per cent, so that a stripe seems to constrain motion along itself."""
 SAMPLED_POINTS = 4800
 """Number of evenly spread points that the information is taken from if there are twice as many or more."""
 MIN_INFORMATION = 0.01

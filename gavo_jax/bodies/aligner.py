@@ -22,6 +22,7 @@ from gavo_jax.bodies.pixel_evidence import inverse_depth_of
 from gavo_jax.bodies.scene import AwareState, FrameView, MotionSegmenter
 from gavo_jax.bodies.surfaces import whole_surfaces
 from gavo_jax.datasets.base import Frame
+from gavo_jax.frame_checks import MAX_INTERVAL_RATIO
 from gavo_jax.odometry.aligners import Aligner, Attempt, FrameSearch, agree, side_by_side
 from gavo_jax.odometry.plausibility import depth_alone_disagrees
 from gavo_jax.odometry.tracking import Clock, TrackerState, as_exposed
@@ -50,8 +51,6 @@ LARGE = 0.25
 """Share of the image covered by bodies above which the last motion may stand in for one that is not found."""
 MAX_SECONDS_EXTRAPOLATED = 0.5
 """Longest time, in seconds, for which the last motion may stand in for one that is not found."""
-MISSED = 2.5
-"""Ratio of a motion's duration to the last one's above which frames were lost in between."""
 NEARLY_AS_GOOD = 0.85
 """Support of another motion, relative to the best one's, above which it may be the camera's as well."""
 SUSPICIOUS = 0.02
@@ -184,7 +183,7 @@ class BodyAware:
         The time is in seconds; 0 where a motion was found.
         """
         attempt, before = self._share_out(state, frame, clock, seen), state.scene.seconds_extrapolated
-        has_missed = float(clock.elapsed) > MISSED * float(state.tracker.seconds)
+        has_missed = float(clock.elapsed) > MAX_INTERVAL_RATIO * float(state.tracker.seconds)
         if attempt.usable or has_missed or not before < MAX_SECONDS_EXTRAPOLATED:
             return attempt, 0.0
         covered = float(np.mean(np.asarray(state.scene.tracks.labels) > 0))
