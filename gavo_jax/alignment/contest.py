@@ -19,7 +19,7 @@ LEAST_EVIDENCE = 0.02
 KNOWN, FOUND, ALIASES, WINNER = range(4)
 """Rounds: motions known beforehand, those that a search finds, the aliases of the best of both on a repetitive pattern,
 and the best of all on the finest level."""
-CLOSE = 0.9
+CLOSE = 0.8
 """Ratio of a motion's evidence to the largest above which both are even. Then the points that each sees decide: a plain
 wall matches itself anywhere, so a smaller motion, which keeps more of it in view, has more evidence but is no better.
 """
@@ -32,7 +32,9 @@ class Entry(NamedTuple):
 
     motion: Float[Array, "*k 4 4"]
     evidence: Evidence
-    """Negative infinity in an empty place."""
+    """By fixed scales, which its bounds are for; negative infinity in an empty place."""
+    at_best: Evidence
+    """Under the noise that explains the motion best, by which motions are compared."""
     brightness: Brightness
     """Brightness with which the motion was refined."""
 
@@ -63,9 +65,9 @@ def hold_contest(
     found, kept = jax.eval_shape(search)
     places = max(known.shape[0], found.shape[0], aliases.shape[0])
     like = partial(jax.tree.map, lambda leaf: jnp.zeros(leaf.shape, leaf.dtype))
-    nothing = jnp.float32(-jnp.inf)
+    nothing = Evidence(jnp.float32(-jnp.inf), jnp.float32(-jnp.inf))
     blank: Entry = like(jax.eval_shape(lambda: refine(jnp.eye(4), jnp.array(True))))
-    blank = blank._replace(motion=jnp.eye(4), evidence=Evidence(nothing, nothing))
+    blank = Entry(jnp.eye(4), nothing, nothing, blank.brightness)
     rows = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (WINNER + 1, places, *leaf.shape)), blank)
 
     def fill(motions: jax.Array) -> jax.Array:
@@ -115,7 +117,7 @@ def _competing(rows: Entry) -> Entry:
 def _best(rows: Entry) -> Entry:
     """Return the entry that wins."""
     entries = _competing(rows)
-    winner = _winner(entries.evidence)
+    winner = _winner(entries.at_best)
     return jax.tree.map(lambda leaf: leaf[winner], entries)
 
 
@@ -131,7 +133,7 @@ def _lead(rows: Entry) -> Float[Array, ""]:
 
     Only the points that each sees count, as a larger overlap alone makes no motion better.
     """
-    motions, of, _ = _competing(rows)
+    motions, _, of, _ = _competing(rows)
     winner = _winner(of)
     is_rival = of.total >= LEAST_RIVAL * of.total[winner]
     costs = jnp.where(is_rival, 1.0 / jnp.maximum(of.seen, LEAST_EVIDENCE), jnp.inf)

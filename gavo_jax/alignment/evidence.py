@@ -5,13 +5,19 @@ Errors of candidates from different searches are therefore not comparable, but t
 same points of both frames, with the same fixed scales. Each point in view contributes the log-likelihood ratio of its
 residuals under "the frames match here" and "two random pixels of these frames meet here". A point that is out of view
 or occluded contributes nothing.
+
+Wide scales let a search see a motion from afar. Before plain walls they also let a motion that is off by decimetres
+pass for the true one, and a larger overlap then outweighs a better match. Motions that were refined are therefore
+compared under the noise that explains each of them best: the profile likelihood over both scales.
 """
 
 from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from gavo_jax.objective.error import Objective
@@ -23,6 +29,8 @@ GREY_SCALE = 15.0
 """Grey residual of a match, grey levels: from noise, a change of gain and an error of half a pixel."""
 DEPTH_SCALE = 0.02
 """Inverse-depth residual of a match, 1/m: a few times the quantisation of a structured-light sensor."""
+GREY_SCALES, DEPTH_SCALES = (2.0, 4.0, 8.0, GREY_SCALE), (0.003, 0.006, 0.01, DEPTH_SCALE)
+"""Noise that may explain a refined motion: any pair of these."""
 LEAST_GREY_SPREAD, LEAST_DEPTH_SPREAD = 20.0, 0.05
 """Lower bounds on the difference of two random pixels of a frame (grey levels, 1/m)."""
 MISMATCH = 0.2
@@ -62,10 +70,27 @@ class Held(NamedTuple):
 
 def evidence(objective: Objective, target_T_reference: Float[Array, "4 4"], points: int = POINTS) -> Evidence:
     """Return the evidence for one motion from both directions of an objective, ignoring its scales and brightness."""
-    sums = _sums(objective, target_T_reference, points)
+    return _evidence(objective, target_T_reference, points, (GREY_SCALE,), (DEPTH_SCALE,))
+
+
+def evidence_at_best(objective: Objective, target_T_reference: Float[Array, "4 4"]) -> Evidence:
+    """Return the evidence for one refined motion under the noise that explains it best."""
+    return _evidence(objective, target_T_reference, POINTS, GREY_SCALES, DEPTH_SCALES)
+
+
+def _evidence(
+    objective: Objective,
+    motion: Float[Array, "4 4"],
+    points: int,
+    grey_scales: tuple[float, ...],
+    depth_scales: tuple[float, ...],
+) -> Evidence:
+    scales = np.array(list(product(grey_scales, depth_scales)), np.float32)
+    totals, seen, readings = _sums(objective, motion, points, scales)
     if objective.backward is not None:
-        sums = sums + _sums(objective.backward, rigid_inverse(target_T_reference), points)
-    total, seen, readings = sums
+        back = _sums(objective.backward, rigid_inverse(motion), points, scales)
+        totals, seen, readings = totals + back[0], seen + back[1], readings + back[2]
+    total = jnp.max(totals)
     return Evidence(total / jnp.maximum(readings, 1.0), total / jnp.maximum(seen, LEAST_SEEN * readings + 1.0))
 
 
@@ -88,8 +113,10 @@ def is_held(objective: Objective, target_T_reference: Float[Array, "4 4"], direc
     return Held(jnp.all(fallen.reshape(2, 6) < here - LEAST_FALL * jnp.abs(here), axis=0), steps)
 
 
-def _sums(objective: Objective, motion: Float[Array, "4 4"], points: int) -> Float[Array, " 3"]:
-    """Sum of the log-likelihood ratios, number of points seen, and number of readings, in one direction."""
+def _sums(
+    objective: Objective, motion: Float[Array, "4 4"], points: int, scales: Float[np.ndarray, "s 2"]
+) -> tuple[Float[Array, " s"], Float[Array, ""], Float[Array, ""]]:
+    """Sums of the log-likelihood ratios under some scales, number of points seen, and number of readings, one way."""
     few = replace(objective.sample(points), backward=None, centred=None)
     reference = few.reference
     has_reading = reference.points.q > 0
@@ -104,15 +131,17 @@ def _sums(objective: Objective, motion: Float[Array, "4 4"], points: int) -> Flo
     hidden = depth * (r.depth > HIDDEN * DEPTH_SCALE)
     fits = r.inside * jnp.where(depth > 0, jnp.abs(r.depth) < HIDDEN * DEPTH_SCALE, MAY_BE_HIDDEN)
     exposure = jnp.sum(fits * r.grey) / jnp.maximum(jnp.sum(fits), 1.0)
-    ratio = _log_ratio(r.grey - exposure, GREY_SCALE, grey_spread) + depth * _log_ratio(
-        r.depth, DEPTH_SCALE, depth_spread
-    )
-    logarithm = jnp.logaddexp(jnp.log(MISMATCH), jnp.log1p(-MISMATCH) + ratio)
     seen = r.inside * (1.0 - hidden)
-    return jnp.stack([jnp.sum(seen * logarithm), jnp.sum(seen), jnp.sum(has_reading.astype(jnp.float32))])
+
+    def total(scale: jax.Array) -> jax.Array:
+        ratio = _log_ratio(r.grey - exposure, scale[0], grey_spread)
+        ratio += depth * _log_ratio(r.depth, scale[1], depth_spread)
+        return jnp.sum(seen * jnp.logaddexp(jnp.log(MISMATCH), jnp.log1p(-MISMATCH) + ratio))
+
+    return jax.vmap(total)(jnp.asarray(scales)), jnp.sum(seen), jnp.sum(has_reading.astype(jnp.float32))
 
 
-def _log_ratio(residual: jax.Array, scale: float, spread: jax.Array) -> jax.Array:
+def _log_ratio(residual: jax.Array, scale: jax.Array, spread: jax.Array) -> jax.Array:
     """Log-likelihood ratio of a residual under a normal distribution of one scale and under a wider one."""
     wide = jnp.sqrt(spread**2 + scale**2)
     return jnp.log(wide / scale) - 0.5 * residual**2 * (1.0 / scale**2 - 1.0 / wide**2)
