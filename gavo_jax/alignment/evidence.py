@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from gavo_jax.objective.error import Objective
@@ -29,8 +28,8 @@ GREY_SCALE = 15.0
 """Grey residual of a match, grey levels: from noise, a change of gain and an error of half a pixel."""
 DEPTH_SCALE = 0.02
 """Inverse-depth residual of a match, 1/m: a few times the quantisation of a structured-light sensor."""
-GREY_SCALES, DEPTH_SCALES = (2.0, 4.0, 8.0, GREY_SCALE), (0.003, 0.006, 0.01, DEPTH_SCALE)
-"""Noise that may explain a refined motion: any pair of these."""
+NOISES = tuple(product((2.0, 4.0, 8.0, GREY_SCALE), (0.003, 0.006, 0.01, DEPTH_SCALE)))
+"""Pairs of scales (grey, inverse depth) of the noise that may explain a refined motion."""
 LEAST_GREY_SPREAD, LEAST_DEPTH_SPREAD = 20.0, 0.05
 """Lower bounds on the difference of two random pixels of a frame (grey levels, 1/m)."""
 MISMATCH = 0.2
@@ -70,26 +69,22 @@ class Held(NamedTuple):
 
 def evidence(objective: Objective, target_T_reference: Float[Array, "4 4"], points: int = POINTS) -> Evidence:
     """Return the evidence for one motion from both directions of an objective, ignoring its scales and brightness."""
-    return _evidence(objective, target_T_reference, points, (GREY_SCALE,), (DEPTH_SCALE,))
+    return _evidence(objective, target_T_reference, points, ((GREY_SCALE, DEPTH_SCALE),))
 
 
 def evidence_at_best(objective: Objective, target_T_reference: Float[Array, "4 4"]) -> Evidence:
     """Return the evidence for one refined motion under the noise that explains it best."""
-    return _evidence(objective, target_T_reference, POINTS, GREY_SCALES, DEPTH_SCALES)
+    return _evidence(objective, target_T_reference, POINTS, NOISES)
 
 
 def _evidence(
-    objective: Objective,
-    motion: Float[Array, "4 4"],
-    points: int,
-    grey_scales: tuple[float, ...],
-    depth_scales: tuple[float, ...],
+    objective: Objective, motion: Float[Array, "4 4"], points: int, noises: tuple[tuple[float, float], ...]
 ) -> Evidence:
-    scales = np.array(list(product(grey_scales, depth_scales)), np.float32)
-    totals, seen, readings = _sums(objective, motion, points, scales)
+    scales = jnp.array(noises)
+    sums = _sums(objective, motion, points, scales)
     if objective.backward is not None:
-        back = _sums(objective.backward, rigid_inverse(motion), points, scales)
-        totals, seen, readings = totals + back[0], seen + back[1], readings + back[2]
+        sums = jax.tree.map(jnp.add, sums, _sums(objective.backward, rigid_inverse(motion), points, scales))
+    totals, seen, readings = sums
     total = jnp.max(totals)
     return Evidence(total / jnp.maximum(readings, 1.0), total / jnp.maximum(seen, LEAST_SEEN * readings + 1.0))
 
@@ -114,7 +109,7 @@ def is_held(objective: Objective, target_T_reference: Float[Array, "4 4"], direc
 
 
 def _sums(
-    objective: Objective, motion: Float[Array, "4 4"], points: int, scales: Float[np.ndarray, "s 2"]
+    objective: Objective, motion: Float[Array, "4 4"], points: int, scales: Float[Array, "s 2"]
 ) -> tuple[Float[Array, " s"], Float[Array, ""], Float[Array, ""]]:
     """Sums of the log-likelihood ratios under some scales, number of points seen, and number of readings, one way."""
     few = replace(objective.sample(points), backward=None, centred=None)
@@ -138,7 +133,7 @@ def _sums(
         ratio += depth * _log_ratio(r.depth, scale[1], depth_spread)
         return jnp.sum(seen * jnp.logaddexp(jnp.log(MISMATCH), jnp.log1p(-MISMATCH) + ratio))
 
-    return jax.vmap(total)(jnp.asarray(scales)), jnp.sum(seen), jnp.sum(has_reading.astype(jnp.float32))
+    return jax.vmap(total)(scales), jnp.sum(seen), jnp.sum(has_reading.astype(jnp.float32))
 
 
 def _log_ratio(residual: jax.Array, scale: jax.Array, spread: jax.Array) -> jax.Array:
