@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from faults import Damaged, every_frame, follow, is_wrong, known_drift
 
-from gavo_jax.camera import Camera
+from gavo_jax.camera import Camera, vignetting_gain
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.output.screen import number
@@ -101,6 +101,18 @@ def with_camera(camera_of: Callable[[Camera], Camera], grey: Callable, depth: Ca
     def change(clip: FrameSequence) -> Damaged:
         sequence = images(clip)
         sequence.camera = camera_of(clip.camera)
+        return sequence
+
+    return change
+
+
+def vignette(is_known: bool) -> Condition:
+    """Darken the image away from its middle as lenses do, by 45 % in its corners; the camera says so, or does not."""
+
+    def change(clip: FrameSequence) -> Damaged:
+        lens = replace(clip.camera, vignetting=(1.2, 0.36))
+        sequence = grey(lambda _, levels: levels / vignetting_gain(lens))(clip)
+        sequence.camera = lens if is_known else clip.camera
         return sequence
 
     return change
@@ -181,7 +193,8 @@ CONDITIONS: dict[str, Condition] = {
     "a shadow that passes": gain(
         lambda index, columns, rows: 1 - 0.4 / (1 + np.exp(16 * np.abs(columns + 1.3 - 0.04 * (index % 65)) - 5))
     ),
-    "vignette": gain(lambda index, columns, rows: 1.0 - 0.15 * (columns**2 + rows**2)),
+    "vignette": vignette(is_known=False),
+    "a known vignette": vignette(is_known=True),
     "shade": gain(lambda index, columns, rows: 1 - 0.3 / (1 + np.exp(5 * columns + 1.6 * np.sin(0.1 * index)))),
     "black bars": gain(lambda index, columns, rows: np.abs(rows) < 0.75),
     "noisy depth": depth(

@@ -1,4 +1,4 @@
-"""The pinhole camera: intrinsics, pyramid levels, projection (5)(6), lens distortion; named presets."""
+"""The pinhole camera: intrinsics, pyramid levels, projection (5)(6), lens distortion, vignetting; named presets."""
 
 import re
 from dataclasses import dataclass, replace
@@ -26,11 +26,11 @@ OFF_AXIS = 10.0, 10001
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["fx", "fy", "cx", "cy", "depth_scale", "readout"],
-    meta_fields=["width", "height", "distortion", "model"],
+    meta_fields=["width", "height", "distortion", "model", "vignetting"],
 )
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera with its image size; a JAX pytree (sizes and distortion are static).
+    """A pinhole camera with its image size; a JAX pytree (sizes, distortion and vignetting are static).
 
     Pixel centres have integer coordinates: the image covers [-1/2, width - 1/2] × [-1/2, height - 1/2].
 
@@ -46,6 +46,9 @@ class Camera:
         depth_scale: raw depth units per metre (metres = raw / depth_scale).
         readout: seconds from the exposure of the first row to that of the last (rolling shutter); 0 = all at once.
         model: distortion model: "pinhole" (Brown-Conrady, also rational) or "fisheye" (equidistant).
+        vignetting: how the images as recorded darken away from the optical axis, as k1, k2, … of the factor that undoes
+            it: 1 + k1 r² + k2 r⁴ + …, where r is the tangent of the angle to the axis. An ideal lens darkens by the
+            cosine's fourth power, which is (2, 1). Empty = not at all.
 
     Raises:
         GavoError: a side is not a whole number of pixels, or a length or scale is negative. Traced values and other
@@ -62,6 +65,7 @@ class Camera:
     depth_scale: float = 5000.0
     readout: float = 0.0
     model: Literal["pinhole", "fisheye"] = "pinhole"
+    vignetting: tuple[float, ...] = ()
 
     def __post_init__(self):
         for name in ("width", "height"):
@@ -88,6 +92,11 @@ class Camera:
     def is_distorted(self) -> bool:
         """Whether recorded images have lens distortion; a fisheye's do even if all coefficients are 0."""
         return self.model == "fisheye" or any(self.distortion)
+
+    @property
+    def is_rectified(self) -> bool:
+        """Whether its images need no rectification: they have neither distortion nor vignetting."""
+        return not self.is_distorted and not any(self.vignetting)
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
@@ -146,31 +155,39 @@ class Camera:
         return _reach(self.distortion, self.model)
 
     def rectified(self) -> "Camera":
-        """Return the camera of undistorted images: the same intrinsics, no distortion."""
-        return replace(self, distortion=(0.0,) * 5, model="pinhole")
+        """Return the camera of rectified images: the same intrinsics, no distortion, no vignetting."""
+        return replace(self, distortion=(0.0,) * 5, model="pinhole", vignetting=())
 
     def undistort(
         self, grey: UInt8[np.ndarray, "height width *channels"], depth: UInt16[np.ndarray, "height width"]
     ) -> tuple[UInt8[np.ndarray, "height width *channels"], UInt16[np.ndarray, "height width"]]:
-        """Remove the lens distortion from an image (grey or colour) and its depth; their camera is then `rectified()`.
+        """Rectify an image (grey or colour) and its depth; their camera is then `rectified()`.
 
-        Returns the same objects if the camera has no distortion.
+        Returns the same objects if there is nothing to remove.
         """
         return self.undistort_image(grey), self.undistort_depth(depth)
 
     def undistort_image(self, image: UInt8[np.ndarray, "height width *channels"]) -> np.ndarray:
-        """Undistort a grey or colour image, bilinearly, with a replicated border.
+        """Undistort a grey or colour image, bilinearly, with a replicated border, and remove its vignetting.
 
-        A black rim would stand still while the scene moves.
+        A black rim would stand still while the scene moves. Levels that end above 255 become 255, which counts as
+        saturated.
 
         Raises:
             ValueError: the image is not of the camera's size.
         """
-        if not self.is_distorted:
+        if self.is_rectified:
             return image
         self._check_size(image)
-        coordinates, fractions, _ = _undistortion_maps(self._on_host())
-        return cv2.remap(image, coordinates, fractions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        if self.is_distorted:
+            coordinates, fractions, _ = _undistortion_maps(self._on_host())
+            image = cv2.remap(image, coordinates, fractions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        if any(self.vignetting):
+            gain = vignetting_gain(self._on_host())
+            gain = gain if image.ndim == 2 else cv2.merge([gain] * image.shape[2])
+            kind = cv2.CV_8U if image.dtype == np.uint8 else cv2.CV_32F
+            image = np.minimum(cv2.multiply(image, gain, dtype=kind), 255)
+        return image
 
     def undistort_depth(self, depth: UInt16[np.ndarray, "height width"]) -> np.ndarray:
         """Undistort raw depth by nearest neighbour (never mixed across an edge).
@@ -265,6 +282,8 @@ def require_camera(camera: Camera) -> None:
         raise GavoError(
             f"camera: distortion: expected a tuple of {', '.join(map(str, counts))} numbers, got {distortion!r}"
         )
+    if not (isinstance(camera.vignetting, tuple) and all(map(_is_number, camera.vignetting))):
+        raise GavoError(f"camera: vignetting: expected a tuple of numbers, got {camera.vignetting!r}")
     if min(camera.width, camera.height) < MIN_SIDE:
         size = f"{camera.width}x{camera.height}"
         raise GavoError(f"images of {size} are too small: the search needs at least {MIN_SIDE} pixels per side")
@@ -313,6 +332,13 @@ def _undistortion_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarr
         np.where(inside, u, outside), np.where(inside, v, outside), cv2.CV_16SC2, nninterpolation=True
     )
     return coordinates, fractions, nearest
+
+
+@lru_cache(maxsize=8)
+def vignetting_gain(camera: Camera) -> Float[np.ndarray, "height width"]:
+    """Return the factor by which each pixel of an undistorted image is brightened."""
+    x, y = to_ray(camera, np.arange(camera.width), np.arange(camera.height)[:, None])
+    return np.polyval([*camera.vignetting[::-1], 1.0], x**2 + y**2).astype(np.float32)
 
 
 NAMES_OF_SEQUENCES = {

@@ -194,7 +194,8 @@ def test_conditions_are_compared_with_the_clip_as_it_is(load, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    "name", ["bands of 8 %", "vignette", "shade", "black bars", "JPEG 30", "half size", "middle quarter"]
+    "name",
+    ["bands of 8 %", "vignette", "a known vignette", "shade", "black bars", "JPEG 30", "half size", "middle quarter"],
 )
 def test_a_condition_keeps_images_and_camera_alike(load, name: str) -> None:
     conditions: ModuleType = load("conditions")

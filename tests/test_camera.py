@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gavo_jax.camera import PRESETS, RIM, Camera, preset_for_sequence, require_camera
+from gavo_jax.camera import PRESETS, RIM, Camera, preset_for_sequence, require_camera, vignetting_gain
 from gavo_jax.camera_files.calibration import load_camera
 from gavo_jax.errors import GavoError
 
@@ -152,6 +152,39 @@ def test_without_distortion_the_same_objects_come_back():
     assert Camera.preset("fr1").rectified().fx == 517.3
 
 
+def test_vignetting_is_undone_in_all_kinds_of_images():
+    """Dark corners stand still while the scene moves: they drew the motion of corridors with them."""
+    camera = replace(SMALL, vignetting=(2.0, 1.0))
+    x, y = (np.arange(64) - SMALL.cx) / SMALL.fx, (np.arange(48)[:, None] - SMALL.cy) / SMALL.fy
+    fourth_power = np.cos(np.arctan(np.hypot(x, y))) ** 4
+    assert fourth_power.min() < 0.8, "a wide view"
+    flat = (100.0 * fourth_power).astype(np.float32)
+    depth = np.ones((48, 64), np.uint16)
+    grey, same_depth = camera.undistort(flat, depth)
+    assert same_depth is depth and grey.dtype == np.float32
+    np.testing.assert_allclose(grey, 100.0, rtol=1e-5)
+    bytes_of_it = np.round(np.dstack([flat] * 3)).astype(np.uint8)
+    color = camera.undistort_image(bytes_of_it)
+    assert color.dtype == np.uint8 and np.abs(color.astype(int) - 100).max() <= 1
+    white = np.full((48, 64), 250, np.uint8)
+    assert camera.undistort_image(white).min() >= 250 and camera.undistort_image(white.astype(float)).max() == 255
+    assert not camera.is_rectified and not camera.is_distorted and camera.rectified() == SMALL.rectified()
+
+
+def test_vignetting_is_undone_after_distortion():
+    camera = replace(Camera.preset("fr1"), vignetting=(0.5,))
+    flat = np.full((480, 640), 100, np.uint8)
+    gain = vignetting_gain(camera)
+    assert gain[0, 0] == pytest.approx(1 + 0.5 * ((camera.cx / camera.fx) ** 2 + (camera.cy / camera.fy) ** 2))
+    assert np.abs(camera.undistort_image(flat) - 100 * gain).max() <= 0.51
+
+
+@pytest.mark.parametrize("vignetting", [(np.nan,), ("dark",), [0.1], 0.1])
+def test_vignetting_is_a_tuple_of_numbers(vignetting):
+    with pytest.raises(GavoError, match="vignetting: expected a tuple of numbers"):
+        require_camera(replace(SMALL, vignetting=vignetting))
+
+
 def test_undistortion_refuses_another_size():
     with pytest.raises(ValueError, match="480 rows"):
         Camera.preset("fr1").undistort_image(np.zeros((240, 320), np.uint8))
@@ -198,6 +231,8 @@ def test_camera_files(tmp_path):
     expected = replace(SMALL, distortion=(0.1, -0.2, 0.0, 0.001, 0.0), depth_scale=1000.0)
     assert load_camera(str(tmp_path / "b.yaml")) == expected
     assert load_camera(tmp_path / "c.toml").distortion == (0.1, -0.2, 0.0, 0.001, 0.3)
+    (tmp_path / "d.toml").write_text(TOML + "vignetting = [0.9, 0.2]\n")
+    assert load_camera(tmp_path / "d.toml") == replace(SMALL, vignetting=(0.9, 0.2))
     (tmp_path / "d.toml").write_text(TOML + "readout = 0.02\n")
     assert load_camera(tmp_path / "d.toml") == replace(SMALL, readout=0.02)
     assert load_camera("fr2") == Camera.preset("fr2")

@@ -82,7 +82,7 @@ def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
     depth = with_zeros(depth)
     if isinstance(grey, np.ndarray) and isinstance(depth, np.ndarray):
         grey, depth = without_bars(grey, depth)
-    if camera.is_distorted:
+    if not camera.is_rectified:
         grey, depth = camera.undistort(np.asarray(grey), np.asarray(depth))
     return Images(grey, depth)
 
@@ -112,7 +112,7 @@ def stacked_images(side: Any, camera: Camera) -> Images:
         raise GavoError("a batch of no frames: expected at least one pair")
     if is_stacked:
         side = tuple(map(_plain, side))
-        if camera.is_distorted:
+        if not camera.is_rectified:
             return stacked_images(list(zip(*side, strict=True)), camera)
         for name, images in zip(("grey", "depth"), side, strict=True):
             require_image(name, images, (len(side[0]), camera.height, camera.width))

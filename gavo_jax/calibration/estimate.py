@@ -4,6 +4,7 @@ Two frames agree best if the camera's parameters are right. Each parameter shows
 
 - **Readout** of a rolling shutter: in the grey residuals, as the camera speeds up and slows down.
 - **Delay** of depth: in the depth residuals. The motion follows the images, and depth follows it late or early.
+- **Vignetting**: in the grey residuals, as the scene moves towards the image's rim or away from it.
 - **Focal length** and **principal point**: in the grey residuals, as a turn moves the image's rim more than its middle.
 - **Depth scale**: in none of them. With depth registered to colour, a world twice as large looks the same. For a first
   Kinect and similar sensors the steps between depths show it (`datasets.depth_unit`); for others nothing does.
@@ -16,25 +17,19 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Integer
 
+from gavo_jax.calibration.motion import LEAST_FRAMES, stretches_of_motion
 from gavo_jax.calibration.pairs import Kinematics, Matched, Stretch, Unknowns, match_pairs
 from gavo_jax.calibration.scan import Minimum, Score, coarse, refine
-from gavo_jax.camera import Camera
+from gavo_jax.camera import Camera, to_ray
 from gavo_jax.compilation.precision import in_32_bits
-from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.depth_unit import COMMON, KINECT_VIEW, sample_sequence
 from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.errors import GavoError
 
-Wanted = Literal["readout", "depth_delay", "depth_scale", "focal_length", "principal_point"]
-ALWAYS: tuple[Wanted, ...] = ("readout", "depth_delay", "depth_scale")
+Wanted = Literal["readout", "depth_delay", "depth_scale", "vignetting", "focal_length", "principal_point"]
+ALWAYS: tuple[Wanted, ...] = ("readout", "depth_delay", "depth_scale", "vignetting")
 
-WINDOW = 45
-"""Number of frames of a stretch, a second and a half; enough for several turns back and forth."""
-WINDOWS = 2
-"""Number of stretches, those with the most motion."""
-LEAST_FRAMES = 12
-MOST_SEARCHED = 3000
-"""Number of frames that are searched for stretches."""
 APART = 3
 """Distance in frames of the pairs that determine the focal length and the principal point. The effect of these grows
 with the motion, and that of the shutter doesn't."""
@@ -43,19 +38,21 @@ EDGE = 2
 
 LONGEST_READOUT, LONGEST_DELAY = 0.05, 0.05
 """Longest readout and longest delay of depth that are tried, seconds."""
-READOUT_STEP, DELAY_STEP, FOCAL_STEP, CENTRE_STEP = 0.004, 0.005, 0.015, 4.0
-"""Spacing of the values that parabolas are fitted to: seconds, seconds, share, pixels."""
+READOUT_STEP, DELAY_STEP, FOCAL_STEP, CENTRE_STEP, VIGNETTING_STEP = 0.004, 0.005, 0.015, 4.0, 0.1
+"""Spacing of the values that parabolas are fitted to: seconds, seconds, share, pixels, 1."""
 FOCAL_RANGE, CENTRE_RANGE = 0.25, 40.0
 """Range that is tried on either side of the given camera's values, share and pixels."""
+VIGNETTING_RANGE = -0.25, 3.0
+"""Range of vignetting that is tried: a of (1 + a r²)⁻², which is 1 for an ideal lens."""
 ROUNDS = 2
 """Number of passes: each parameter is estimated with the others fixed, so all are estimated again."""
 
-TOO_UNSURE = {"readout": 0.005, "depth_delay": 0.005, "focal_length": 0.03, "principal_point": 6.0}
-"""Standard deviation from which a parameter counts as undetermined: seconds, seconds, share, pixels."""
+TOO_UNSURE = {"readout": 0.005, "depth_delay": 0.005, "focal_length": 0.03, "principal_point": 6.0, "vignetting": 0.2}
+"""Standard deviation from which a parameter counts as undetermined: seconds, seconds, share, pixels, 1."""
 
-SHARED = {"readout": 0.002, "depth_delay": 0.002, "focal_length": 0.01, "principal_point": 2.0}
+SHARED = {"readout": 0.002, "depth_delay": 0.002, "focal_length": 0.01, "principal_point": 2.0, "vignetting": 0.03}
 """Deviation common to all pairs, which their scatter doesn't show: the error on rendered frames of a known camera.
-Seconds, seconds, share, pixels."""
+Seconds, seconds, share, pixels, 1."""
 
 STEPS_DEVIATION = 0.04
 """Relative standard deviation of the depth steps' factor among cameras of that make."""
@@ -80,7 +77,8 @@ class CameraEstimate:
     """Estimated parameters by name, and the camera with them.
 
     Attributes:
-        found: readout, depth_delay, depth_scale (of the files) and, on request, fx, fy, cx and cy.
+        found: readout, depth_delay, depth_scale (of the files), vignetting (a of (1 + a r²)⁻², beyond the known one)
+            and, on request, fx, fy, cx and cy.
         camera: camera of the frames as they were given, with the parameters that were determined.
         depth_delay: seconds, in addition to the delay by the frames' own stamps; 0 if it was not determined.
         pairs: number of pairs that were used.
@@ -177,7 +175,7 @@ def estimate_camera(
     if found.keys() == set(wanted):
         return CameraEstimate(found, _with_found(sequence, found), 0.0, 0)
     on_progress("looking for stretches of motion")
-    stretches = [Stretch.of(frames, camera) for frames in _stretches(sequence)]
+    stretches = [Stretch.of(frames, camera) for frames in stretches_of_motion(sequence)]
     unknowns = Unknowns.of(camera)
     if "readout" in wanted:  # searched from a global shutter on, whatever the camera says
         unknowns = unknowns._replace(readout=0.0)
@@ -258,9 +256,25 @@ def _find_centre(trial: _Trial, interval: float, is_first: bool) -> dict[str, Mi
     return minima
 
 
+def _find_vignetting(trial: _Trial, interval: float, is_first: bool) -> dict[str, Minimum]:
+    del interval
+    score = trial.apart(APART).score("grey", lambda unknowns, value: unknowns._replace(vignetting=value))
+    low, high = VIGNETTING_RANGE
+    start = coarse(score, np.array([0.0, 0.2, 0.4, 0.8, 1.6])) if is_first else float(trial.unknowns.vignetting)
+    least = refine(score, start, VIGNETTING_STEP, low, high)
+    trial.unknowns = trial.unknowns._replace(vignetting=least.value)
+    return {"vignetting": least}
+
+
+def lens_vignetting(amount: float) -> tuple[float, ...]:
+    """Return coefficients of `Camera.vignetting` for a of (1 + a r²)⁻²; none for 0."""
+    return (2 * amount, amount**2) if amount else ()
+
+
 _STAGES: dict[str, Callable[[_Trial, float, bool], dict[str, Minimum]]] = {
     "readout": _find_readout,
     "depth_delay": _find_delay,
+    "vignetting": _find_vignetting,
     "focal_length": _find_focal,
     "principal_point": _find_centre,
 }
@@ -269,6 +283,7 @@ _STAGES: dict[str, Callable[[_Trial, float, bool], dict[str, Minimum]]] = {
 _KINDS: dict[str, tuple[str, str, str]] = {
     "readout": ("readout", "s", "grey residuals"),
     "depth_delay": ("depth_delay", "s", "depth residuals"),
+    "vignetting": ("vignetting", "", "grey residuals"),
     "fx": ("focal_length", "pixels", "grey residuals"),
     "fy": ("focal_length", "pixels", "grey residuals, with fx"),
     "cx": ("principal_point", "pixels", "grey residuals"),
@@ -290,11 +305,18 @@ def _judged(minima: dict[str, Minimum], trial: _Trial, interval: float, guessed:
         kind, unit, how = _KINDS[name]
         if name == "readout" and least.value >= interval:
             how += "; this is the longest possible, the time between two frames"
+        if name == "vignetting":
+            x, y = to_ray(trial.camera, 0.0, 0.0)
+            dark = 1 - (1 + least.value * (x**2 + y**2)) ** -2
+            how += f"; the image's corners are {100 * dark:.0f} % darker than its middle (1 would be an ideal lens)"
         if unit == "s" and guessed:
             how += f"; only as accurate as the stamps, which are a guess ({guessed})"
         scale = getattr(trial.camera, name) if kind == "focal_length" else 1.0
+        deviation = float(np.hypot(least.deviation, SHARED[kind] * scale))
+        if name == "vignetting" and abs(least.value) < 2 * deviation:
+            least, how = least._replace(value=0.0), "grey residuals; no more than chance"
         if least.deviation < TOO_UNSURE[kind] * scale:
-            found[name] = Found(least.value, float(np.hypot(least.deviation, SHARED[kind] * scale)), unit, how)
+            found[name] = Found(least.value, deviation, unit, how)
         else:
             found[name] = Found(None, None, unit, "the motion in these frames does not determine it")
     return found
@@ -319,67 +341,11 @@ def _depth_scale(sequence: Sequence) -> Found:
 def _with_found(sequence: Sequence, found: dict[str, Found]) -> Camera:
     """Return the frames' camera with what was found; the depth scale is converted from the files' units to theirs."""
     camera, unit = sequence.camera, getattr(sequence, "depth_unit", None)
-    names = ("readout", "depth_scale", "fx", "fy", "cx", "cy")
+    names = ("readout", "depth_scale", "vignetting", "fx", "fy", "cx", "cy")
     values = {name: found[name].value for name in names if name in found}
     known: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+    if "vignetting" in known:
+        known["vignetting"] = lens_vignetting(known["vignetting"])
     if "depth_scale" in known and unit is not None:
         known["depth_scale"] *= unit.frame / unit.file
     return replace(camera, **known)
-
-
-def _stretches(sequence: Sequence) -> list[list[Frame]]:
-    """Return the stretches with the most motion, each of consecutive readable frames.
-
-    Raises:
-        GavoError: none has enough frames.
-    """
-    too_few = GavoError(f"{sequence.name}: needs at least {LEAST_FRAMES} readable frames in a row")
-    if len(sequence) < LEAST_FRAMES:
-        raise too_few
-    count = min(len(sequence), MOST_SEARCHED)
-    length = min(WINDOW, count)
-    changes = _changes(sequence, count)
-    sums = np.convolve(changes, np.ones(length - 1), "valid")
-    chosen: list[int] = []
-    for start in np.argsort(-sums, kind="stable"):
-        if all(abs(int(start) - other) >= length for other in chosen):
-            chosen.append(int(start))
-        if len(chosen) == WINDOWS:
-            break
-    runs = [_readable(sequence, start, length) for start in chosen]
-    runs = [run for run in runs if len(run) >= LEAST_FRAMES]
-    if not runs:
-        raise too_few
-    return runs
-
-
-def _changes(sequence: Sequence, count: int) -> np.ndarray:
-    """Difference of each image from the one before, relative to its contrast; 0 where one cannot be read."""
-    if count <= WINDOW:
-        return np.zeros(max(count - 1, 0))
-    changes, before = np.zeros(count - 1), None
-    for index in range(count):
-        try:
-            grey = np.asarray(sequence[index].grey)[::8, ::8].astype(np.float32)
-        except FrameError:
-            before = None
-            continue
-        if before is not None:
-            changes[index - 1] = np.mean(np.abs(grey - before)) / max(float(grey.std()), 1.0)
-        before = grey
-    return changes
-
-
-def _readable(sequence: Sequence, start: int, length: int) -> list[Frame]:
-    """Return the longest run of readable frames with increasing stamps."""
-    runs: list[list[Frame]] = [[]]
-    for index in range(start, start + length):
-        try:
-            frame = sequence[index]
-        except FrameError:
-            runs.append([])
-            continue
-        if runs[-1] and frame.timestamp <= runs[-1][-1].timestamp:
-            runs.append([])
-        runs[-1].append(frame)
-    return max(runs, key=len)

@@ -36,4 +36,6 @@ def _table(camera: Camera) -> dict[str, object]:
     table |= {"width": camera.width, "height": camera.height}
     if camera.is_distorted:
         table |= {"distortion": [float(value) for value in camera.distortion], "model": camera.model}
+    if any(camera.vignetting):
+        table["vignetting"] = [float(value) for value in camera.vignetting]
     return table | {"readout": float(camera.readout)}

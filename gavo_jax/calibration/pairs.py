@@ -45,11 +45,13 @@ class Unknowns(NamedTuple):
     fy: Any
     cx: Any
     cy: Any
+    vignetting: Any
+    """Vignetting beyond what the frames were rectified by: a of (1 + a r²)⁻², which is 1 for an ideal lens."""
 
     @classmethod
     def of(cls, camera: Camera) -> "Unknowns":
         """Return a camera's own parameters."""
-        return cls(camera.readout, 0.0, camera.fx, camera.fy, camera.cx, camera.cy)
+        return cls(camera.readout, 0.0, camera.fx, camera.fy, camera.cx, camera.cy, 0.0)
 
     def on(self, camera: Camera) -> Camera:
         """Return a camera with these parameters."""
@@ -184,11 +186,15 @@ def match_pairs(stretch: Stretch, kinematics: Kinematics, unknowns: Unknowns, *,
     seen = unknowns.on(camera).level(1)
     levels = levels_of(seen, SOLVER, HALF_SIZE_OBJECTIVE)
 
+    x, y = to_ray(seen, jnp.arange(seen.width), jnp.arange(seen.height)[:, None])
+    gain = (1.0 + unknowns.vignetting * (x**2 + y**2)) ** 2
+    gain /= jnp.mean(gain)  # else residuals would become larger with it
+
     def prepare(frame: Array) -> tuple[Reference, Target]:
         late = stretch.delays[frame] + unknowns.delay
         twist = late * kinematics.velocity[frame] + 0.5 * late**2 * kinematics.acceleration[frame]
         depth = depth_moved(stretch.inverse_depth[frame], seen, exp(twist))
-        pyramid = [PyramidLevel(stretch.grey[frame], depth)]
+        pyramid = [PyramidLevel(stretch.grey[frame] * gain, depth)]
         for _ in levels.numbers[1:]:
             pyramid.append(PyramidLevel(halve_grey(pyramid[-1].grey), halve_inverse_depth(pyramid[-1].inverse_depth)))
         return make_references(tuple(pyramid), seen, levels), prepare_target(tuple(pyramid), levels)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.camera import DISTORTION_COUNTS, MAX_SIDE, MIN_SIDE, PRESETS, Camera
+from gavo_jax.camera import DISTORTION_COUNTS, MAX_SIDE, MIN_SIDE, PRESETS, Camera, vignetting_gain
 from gavo_jax.camera_files.foreign import hint_of_ending
 from gavo_jax.camera_files.makes import PARSERS, PROJECTION, Table
 from gavo_jax.camera_files.words import CAMERA_KEYS, DEVICE_KEYS, MODELS, REQUIRED, model_of
@@ -30,6 +30,11 @@ the numbers are of an image of another size."""
 
 MOST_K1, MOST_TANGENTIAL, MOST_RADIAL = 100.0, 1.0, 1000.0
 """Largest of OpenCV's coefficients; what is larger was meant as something else."""
+
+MOST_VIGNETTING = 6
+"""Largest number of coefficients of vignetting."""
+LEAST_GAIN, MOST_GAIN = 0.5, 10.0
+"""Smallest and largest factor by which vignetting is undone."""
 
 DEPTH_SCALE = 5000.0
 """Default depth scale, units per metre: the TUM benchmark's."""
@@ -123,8 +128,9 @@ def load_calibration(
     """Return the calibration of a preset or from a file.
 
     TOML keys: fx, fy, cx, cy, width, height; optional distortion (a list in OpenCV's order), model ("pinhole" or
-    "fisheye"), depth_scale, readout and depth_delay (seconds). Depth that is not registered to colour: a table [depth]
-    with the same keys, and `colour_T_depth`, four rows of four numbers. YAML: the same keys, ROS `camera_info`, Kalibr.
+    "fisheye"), vignetting (a list, see `Camera`), depth_scale, readout and depth_delay (seconds). Depth that is not
+    registered to colour: a table [depth] with the same keys, and `colour_T_depth`, four rows of four numbers. YAML: the
+    same keys, ROS `camera_info`, Kalibr.
     OpenCV FileStorage: YAML, XML or JSON, also ORB-SLAM's. JSON: Open3D, `cam_params.json` of Replica, intrinsics of
     RealSense's SDK, or NeRF's `transforms.json`. Text: a matrix of 3×3 or 4×4, or one row `fx fy cx cy [distortion]`.
 
@@ -214,7 +220,7 @@ def camera_from_table(path: Path | str, values: Table, depth_scale: float, part:
         raise GavoError(f"{path}: {part}fy: negative ({shown(values['fy'])}), {why}")
     cx, cy = number("cx", -width, 2 * width), number("cy", -height, 2 * height)
     _check_middle(f"{path}: {part}cx, {part}cy", (cx, cy), (width, height))
-    return Camera(
+    camera = Camera(
         fx=number("fx", SHORTEST_LENS * width, LONGEST_LENS * width),
         fy=number("fy", SHORTEST_LENS * height, LONGEST_LENS * height),
         cx=cx,
@@ -225,7 +231,10 @@ def camera_from_table(path: Path | str, values: Table, depth_scale: float, part:
         depth_scale=number("depth_scale", 1e-3, 1e6, depth_scale),
         readout=number("readout", 0, 1, 0.0),
         model=model,
+        vignetting=_vignetting(f"{path}: {part}vignetting", values.get("vignetting", [])),
     )
+    _check_gain(f"{path}: {part}vignetting", camera)
+    return camera
 
 
 def _check_middle(place: str, point: tuple[float, float], size: Size) -> None:
@@ -262,6 +271,20 @@ def _distortion(path: Path | str, part: str, values: Table) -> tuple[tuple[float
         _number(f"{path}: {part}distortion", value, -limit, limit) for value, limit in zip(numbers, most, strict=False)
     )
     return checked + (0.0,) * max(0, (4 if model == "fisheye" else 5) - len(checked)), model
+
+
+def _vignetting(place: str, numbers: Any) -> tuple[float, ...]:
+    if not isinstance(numbers, list) or len(numbers) > MOST_VIGNETTING:
+        raise GavoError(f"{place}: must be a list of up to {MOST_VIGNETTING} numbers (k1 k2 …), not {_count(numbers)}")
+    return tuple(_number(place, value, -MOST_RADIAL, MOST_RADIAL) for value in numbers)
+
+
+def _check_gain(place: str, camera: Camera) -> None:
+    """Refuse coefficients of vignetting that are meant for another unit of radius, pixels say."""
+    gain = vignetting_gain(camera)
+    if not (LEAST_GAIN <= gain.min() and gain.max() <= MOST_GAIN):
+        spread = f"multiplies parts of the image by {gain.min():.3g} to {gain.max():.3g}"
+        raise GavoError(f"{place}: {spread}, more than a lens does; is r the tangent of the angle to the axis?")
 
 
 def _count(numbers: Any) -> str:

@@ -16,7 +16,7 @@ Table = dict[str, Any]
 
 FOCAL = ("fx", "fy", "cx", "cy")
 REQUIRED = (*FOCAL, "width", "height")
-CAMERA_KEYS = (*REQUIRED, "distortion", "model", "depth_scale", "readout")
+CAMERA_KEYS = (*REQUIRED, "distortion", "model", "vignetting", "depth_scale", "readout")
 """Keys of a camera in our own files; `REQUIRED` ones are in every file."""
 DEVICE_KEYS = ("depth_delay",)
 """Keys of our own files that belong to a device, not to one of its cameras."""

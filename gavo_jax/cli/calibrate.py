@@ -3,8 +3,11 @@
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from gavo_jax.calibration.estimate import ALWAYS, CameraEstimate, Found, Wanted, estimate_camera
+import numpy as np
+
+from gavo_jax.calibration.estimate import ALWAYS, CameraEstimate, Found, Wanted, estimate_camera, lens_vignetting
 from gavo_jax.calibration.file import write_camera_file
 from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.camera_files.words import FOCAL
@@ -58,13 +61,21 @@ def calibration_of(sequence: Sequence, estimate: CameraEstimate) -> Calibration:
     unit = getattr(sequence, "depth_unit", None)
     if unit is not None:  # cameras rarely state the unit of floating-point depth files
         before = before.with_depth_scale(unit.file)
-    values = {
+    values: dict[str, Any] = {
         name: found.value for name, found in estimate.found.items() if name != "depth_delay" and found.value is not None
     }
+    if "vignetting" in values:  # the frames were rectified by the known one
+        values["vignetting"] = together(before.color.vignetting, lens_vignetting(values["vignetting"]))
     delay = before.depth_delay + estimate.depth_delay
     lens = replace(sequence.camera, **values).scaled(before.color.width // sequence.camera.width)
     values |= {name: value for name, value in zip(FOCAL, lens, strict=True) if name in values}
     return replace(before.with_color(replace(before.color, **values)), depth_delay=delay)
+
+
+def together(first: tuple[float, ...], second: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the coefficients of two vignettings, one undone after the other."""
+    product = np.polynomial.polynomial.polymul([1.0, *first], [1.0, *second])
+    return tuple(float(value) for value in product[1:])
 
 
 def with_total_delay(found: dict[str, Found], depth_delay: float) -> dict[str, Found]:
@@ -79,7 +90,7 @@ def with_total_delay(found: dict[str, Found], depth_delay: float) -> dict[str, F
 def _cells(found: Found) -> tuple[str, str, str]:
     if found.value is None:
         return "not determined", "", ""
-    digits = 4 if found.unit == "s" else 1
+    digits = {"s": 4, "": 2}.get(found.unit, 1)
     deviation = "" if found.deviation is None else f"{found.deviation:.{digits}f}"
     return f"{found.value:.{digits}f}", deviation, found.unit
 

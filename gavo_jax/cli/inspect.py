@@ -73,8 +73,9 @@ def _camera(camera: dict[str, Any]) -> str:
     size = f"{camera['width']}x{camera['height']}"
     intrinsics = " ".join(f"{name} {camera[name]:g}" for name in ("fx", "fy", "cx", "cy"))
     lens = f", {camera['model']} distortion {camera['distortion']}" if _is_distorted(camera) else ""
+    dark = f", vignetting {camera['vignetting']}" if any(camera["vignetting"]) else ""
     shutter = f", rolling shutter of {round(1e3 * camera['readout'], 1):g} ms" if camera["readout"] else ""
-    return f"{size}, {intrinsics}{lens}{shutter}"
+    return f"{size}, {intrinsics}{lens}{dark}{shutter}"
 
 
 def _is_distorted(camera: dict[str, Any]) -> bool:

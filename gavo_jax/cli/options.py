@@ -265,7 +265,7 @@ class Inspect(Source):
 class Calibrate(Source):
     """Estimate from the images alone what a source does not say about its camera, and write a camera file.
 
-    It finds shutter readout, depth delay and depth scale, starting from the source's camera.
+    It finds shutter readout, depth delay, depth scale and vignetting, starting from the source's camera.
     """
 
     focal_length: bool = False

@@ -130,7 +130,8 @@ def _recorded_camera(run: RecordedRun, folder: Path) -> Camera:
     entry: Any = run.config.get("sequence")
     try:
         values = {name: value for name, value in entry["camera"].items() if name != "type"}
-        camera = Camera(**{**values, "distortion": tuple(values["distortion"])})
+        lists: Any = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
+        camera = Camera(**{**values, **lists})
         require_camera(camera)
     except (AttributeError, KeyError, TypeError):
         raise GavoError(f"{folder / CONFIG}: does not name the camera") from None

@@ -41,8 +41,8 @@ def rectified_at(sequence: Sequence, index: int) -> Frame:
 
 
 def without_distortion(sequence: Sequence) -> Sequence:
-    """Wrap a sequence so that its frames have no lens distortion; one that has none is returned as it is."""
-    return Rectified(sequence) if sequence.camera.is_distorted else sequence
+    """Wrap a sequence so that its frames have no lens distortion or vignetting; without any it is returned as it is."""
+    return Rectified(sequence) if not sequence.camera.is_rectified else sequence
 
 
 class Rectified:

@@ -10,10 +10,11 @@ import pytest
 from small import CAMERA
 
 from gavo_jax.calibration import estimate as estimate_module
-from gavo_jax.calibration.estimate import Found, Wanted, estimate_camera
+from gavo_jax.calibration.estimate import Found, Wanted, estimate_camera, lens_vignetting
 from gavo_jax.calibration.file import write_camera_file
 from gavo_jax.calibration.pairs import Kinematics, Matched, Unknowns, evened
 from gavo_jax.calibration.scan import coarse, refine
+from gavo_jax.camera import vignetting_gain
 from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.cli.calibrate import calibration_of, with_total_delay
 from gavo_jax.datasets.assembly import DepthImage, DepthUnit, FrameAssembler
@@ -69,6 +70,31 @@ def test_shutter_delay_and_lens_are_found_from_the_images():
     assert readout.value == pytest.approx(READOUT, abs=0.003), readout
     assert delay.value == pytest.approx(DELAY, abs=0.003), delay
     assert estimate.camera.readout == readout.value and estimate.depth_delay == delay.value
+
+
+@pytest.mark.parametrize("amount", [0.0, 0.8])
+def test_vignetting_is_found_from_the_images(amount: float) -> None:
+    shaken: Any = Shaken()
+    dark = vignetting_gain(replace(CAMERA, vignetting=lens_vignetting(amount)))
+    shaken.frames = [replace(frame, grey=np.round(frame.grey / dark).astype(np.uint8)) for frame in shaken.frames]
+    estimate = estimate_camera(shaken, ("vignetting",), rounds=1)
+    found: Any = estimate.found["vignetting"]
+    assert found.value == pytest.approx(amount, abs=0.1) and found.deviation < 0.1, found
+    assert estimate.camera.vignetting == lens_vignetting(found.value)
+    assert "no more than chance" in found.why if amount == 0.0 else "% darker than its middle" in found.why
+
+
+def test_vignetting_adds_to_what_the_camera_says() -> None:
+    """Frames are rectified by what is known; a second estimate is of what is left."""
+    found = {"vignetting": Found(0.2, 0.03, "", "")}
+    known = replace(CAMERA, vignetting=lens_vignetting(0.5))
+    sequence: Any = SimpleNamespace(calibration=Calibration(known), camera=known.rectified())
+    estimate: Any = SimpleNamespace(found=found, depth_delay=0.0)
+    both = calibration_of(sequence, estimate).color
+    gain = vignetting_gain(known) * vignetting_gain(replace(CAMERA, vignetting=lens_vignetting(0.2)))
+    np.testing.assert_allclose(vignetting_gain(both), gain, rtol=1e-5)
+    found["vignetting"] = Found(None, None, "", "")
+    assert calibration_of(sequence, estimate).color == known
 
 
 def test_a_readout_is_no_longer_than_the_time_between_two_frames() -> None:
@@ -211,7 +237,9 @@ def test_something_else_that_is_wanted_is_refused():
 
 def test_a_camera_file_holds_what_was_found(tmp_path):
     rig = Calibration(
-        replace(CAMERA, distortion=(0.1, -0.2, 0.0, 0.001, 0.0), readout=0.03), CAMERA, np.eye(4), depth_delay=-0.015
+        replace(CAMERA, distortion=(0.1, -0.2, 0.0, 0.001, 0.0), readout=0.03, vignetting=(0.5, 0.1)),
+        *(CAMERA, np.eye(4)),
+        depth_delay=-0.015,
     )
     write_camera_file(tmp_path / "camera.toml", rig, ("a remark",))
     read = load_calibration(tmp_path / "camera.toml")

@@ -440,6 +440,13 @@ FAULTS = {
     "a turn.txt": ("1 0 0\n0 1 0\n0 0 1\n", "cx, cy: 0 0"),
     "size first.txt": ("640 480 500 510 319.5 239.5 0 0\n", "distortion"),
     "tangential.toml": (TOML + "distortion=[0.1, 0.1, 40, 0]\n", "distortion: must be a number from -1 to 1, not 40"),
+    "vignetting of pixels.toml": (
+        TOML + "vignetting=[0.9, 90.0]\n",
+        "vignetting: multiplies parts of the image by 1 to",
+    ),
+    "black corners.toml": (TOML + "vignetting=[-1.0]\n", "vignetting: multiplies parts of the image by 0."),
+    "vignetting.toml": (TOML + "vignetting=0.9\n", "vignetting: must be a list of up to 6 numbers"),
+    "words of vignetting.toml": (TOML + "vignetting=['much']\n", "vignetting: must be a number"),
     "larger image.txt": ("1170 1170 647 483\n", "middle of an image of about 1294x966, not of 640x480"),
     "columns first.txt": ("500 319.5 510 239.5\n", "does not look like fx fy cx cy"),
     "columns of a wide image.txt": ("910.5 640.2 910.1 360.3\n", "does not look like fx fy cx cy"),

@@ -85,5 +85,7 @@ def _camera_toml(camera: Camera) -> str:
     lines = [f"{key} = {float(getattr(camera, key))!r}" for key in ("fx", "fy", "cx", "cy")]
     lines += [f"{key} = {int(getattr(camera, key))}" for key in ("width", "height")]
     lines += [f"distortion = {[float(k) for k in camera.distortion]}", f"depth_scale = {float(camera.depth_scale)!r}"]
+    if camera.vignetting:
+        lines.append(f"vignetting = {[float(k) for k in camera.vignetting]}")
     lines += [f"readout = {float(camera.readout)!r}", f'model = "{camera.model}"']
     return "\n".join(lines) + "\n"
