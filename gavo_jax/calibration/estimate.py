@@ -4,7 +4,7 @@ Two frames agree best if the camera's parameters are right. Each parameter shows
 
 - **Readout** of a rolling shutter: in the grey residuals, as the camera speeds up and slows down.
 - **Delay** of depth: in the depth residuals. The motion follows the images, and depth follows it late or early.
-- **Vignetting**: in the grey residuals, as the scene moves towards the image's rim or away from it.
+- **Vignetting**: in the light of surfaces that move towards the image's rim or away from it.
 - **Focal length** and **principal point**: in the grey residuals, as a turn moves the image's rim more than its middle.
 - **Depth scale**: in none of them. With depth registered to colour, a world twice as large looks the same. For a first
   Kinect and similar sensors the steps between depths show it (`datasets.depth_unit`); for others nothing does.
@@ -12,6 +12,7 @@ Two frames agree best if the camera's parameters are right. Each parameter shows
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -20,7 +21,8 @@ from jaxtyping import Integer
 from gavo_jax.calibration.motion import LEAST_FRAMES, stretches_of_motion
 from gavo_jax.calibration.pairs import Kinematics, Matched, Stretch, Unknowns, match_pairs
 from gavo_jax.calibration.scan import Minimum, Score, coarse, refine
-from gavo_jax.camera import Camera, to_ray
+from gavo_jax.calibration.vignetting import Blocks, corner_darkness, fit_vignetting, lens_vignetting, seen_twice
+from gavo_jax.camera import Camera
 from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.depth_unit import COMMON, KINECT_VIEW, sample_sequence
@@ -33,21 +35,21 @@ ALWAYS: tuple[Wanted, ...] = ("readout", "depth_delay", "depth_scale", "vignetti
 APART = 3
 """Distance in frames of the pairs that determine the focal length and the principal point. The effect of these grows
 with the motion, and that of the shutter doesn't."""
+FAR_APART = 8
+"""The same for vignetting, which needs no accurate motion."""
 EDGE = 2
 """Number of pairs at either end of a stretch that do not count, as the motion beyond them is unknown."""
 
 LONGEST_READOUT, LONGEST_DELAY = 0.05, 0.05
 """Longest readout and longest delay of depth that are tried, seconds."""
-READOUT_STEP, DELAY_STEP, FOCAL_STEP, CENTRE_STEP, VIGNETTING_STEP = 0.004, 0.005, 0.015, 4.0, 0.1
-"""Spacing of the values that parabolas are fitted to: seconds, seconds, share, pixels, 1."""
+READOUT_STEP, DELAY_STEP, FOCAL_STEP, CENTRE_STEP = 0.004, 0.005, 0.015, 4.0
+"""Spacing of the values that parabolas are fitted to: seconds, seconds, share, pixels."""
 FOCAL_RANGE, CENTRE_RANGE = 0.25, 40.0
 """Range that is tried on either side of the given camera's values, share and pixels."""
-VIGNETTING_RANGE = -0.25, 3.0
-"""Range of vignetting that is tried: a of (1 + a r²)⁻², which is 1 for an ideal lens."""
 ROUNDS = 2
 """Number of passes: each parameter is estimated with the others fixed, so all are estimated again."""
 
-TOO_UNSURE = {"readout": 0.005, "depth_delay": 0.005, "focal_length": 0.03, "principal_point": 6.0, "vignetting": 0.2}
+TOO_UNSURE = {"readout": 0.005, "depth_delay": 0.005, "focal_length": 0.03, "principal_point": 6.0, "vignetting": 0.1}
 """Standard deviation from which a parameter counts as undetermined: seconds, seconds, share, pixels, 1."""
 
 SHARED = {"readout": 0.002, "depth_delay": 0.002, "focal_length": 0.01, "principal_point": 2.0, "vignetting": 0.03}
@@ -257,18 +259,18 @@ def _find_centre(trial: _Trial, interval: float, is_first: bool) -> dict[str, Mi
 
 
 def _find_vignetting(trial: _Trial, interval: float, is_first: bool) -> dict[str, Minimum]:
-    del interval
-    score = trial.apart(APART).score("grey", lambda unknowns, value: unknowns._replace(vignetting=value))
-    low, high = VIGNETTING_RANGE
-    start = coarse(score, np.array([0.0, 0.2, 0.4, 0.8, 1.6])) if is_first else float(trial.unknowns.vignetting)
-    least = refine(score, start, VIGNETTING_STEP, low, high)
-    trial.unknowns = trial.unknowns._replace(vignetting=least.value)
-    return {"vignetting": least}
-
-
-def lens_vignetting(amount: float) -> tuple[float, ...]:
-    """Return coefficients of `Camera.vignetting` for a of (1 + a r²)⁻²; none for 0."""
-    return (2 * amount, amount**2) if amount else ()
+    """Fit it to matched surfaces, not by a search: their light shows it far better than the residuals' scale."""
+    del interval, is_first
+    apart, pairs = trial.apart(FAR_APART), []
+    camera = trial.unknowns.on(trial.camera.rectified()).level(1)
+    for stretch, kinematics in zip(apart.stretches, apart.kinematics, strict=True):
+        frames = [Blocks.of(*images, camera) for images in zip(stretch.grey, stretch.inverse_depth, strict=True)]
+        motions = np.asarray(kinematics.guesses, np.float64)[:-1]
+        pairs += [seen_twice(*both, motion) for both, motion in zip(pairwise(frames), motions, strict=True)]
+    found = fit_vignetting([pair for pair in pairs if pair is not None])
+    if np.isfinite(found.deviation):
+        trial.unknowns = trial.unknowns._replace(vignetting=found.value)
+    return {"vignetting": found}
 
 
 _STAGES: dict[str, Callable[[_Trial, float, bool], dict[str, Minimum]]] = {
@@ -283,7 +285,7 @@ _STAGES: dict[str, Callable[[_Trial, float, bool], dict[str, Minimum]]] = {
 _KINDS: dict[str, tuple[str, str, str]] = {
     "readout": ("readout", "s", "grey residuals"),
     "depth_delay": ("depth_delay", "s", "depth residuals"),
-    "vignetting": ("vignetting", "", "grey residuals"),
+    "vignetting": ("vignetting", "", "light of surfaces"),
     "fx": ("focal_length", "pixels", "grey residuals"),
     "fy": ("focal_length", "pixels", "grey residuals, with fx"),
     "cx": ("principal_point", "pixels", "grey residuals"),
@@ -306,15 +308,14 @@ def _judged(minima: dict[str, Minimum], trial: _Trial, interval: float, guessed:
         if name == "readout" and least.value >= interval:
             how += "; this is the longest possible, the time between two frames"
         if name == "vignetting":
-            x, y = to_ray(trial.camera, 0.0, 0.0)
-            dark = 1 - (1 + least.value * (x**2 + y**2)) ** -2
+            dark = corner_darkness(least.value, trial.camera)
             how += f"; the image's corners are {100 * dark:.0f} % darker than its middle (1 would be an ideal lens)"
         if unit == "s" and guessed:
             how += f"; only as accurate as the stamps, which are a guess ({guessed})"
         scale = getattr(trial.camera, name) if kind == "focal_length" else 1.0
         deviation = float(np.hypot(least.deviation, SHARED[kind] * scale))
         if name == "vignetting" and abs(least.value) < 2 * deviation:
-            least, how = least._replace(value=0.0), "grey residuals; no more than chance"
+            least, how = least._replace(value=0.0), "light of surfaces; no more than chance"
         if least.deviation < TOO_UNSURE[kind] * scale:
             found[name] = Found(least.value, deviation, unit, how)
         else:

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax.calibration.estimate import ALWAYS, CameraEstimate, Found, Wanted, estimate_camera, lens_vignetting
+from gavo_jax.calibration.estimate import ALWAYS, CameraEstimate, Found, Wanted, estimate_camera
 from gavo_jax.calibration.file import write_camera_file
+from gavo_jax.calibration.vignetting import lens_vignetting
 from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.camera_files.words import FOCAL
 from gavo_jax.cli.options import Calibrate

@@ -83,11 +83,11 @@ def _is_distorted(camera: dict[str, Any]) -> bool:
 
 
 def _recorded(recorded: dict[str, Any] | None, camera: dict[str, Any]) -> list[tuple[str, str]]:
-    """Describe the cameras before undistortion, pixel averaging and registration, where they differ."""
+    """Describe the cameras before rectification, pixel averaging and registration, where they differ."""
     if recorded is None:
         return []
     color = recorded["color"]
-    is_other = _is_distorted(color) or color["width"] != camera["width"]
+    is_other = _is_distorted(color) or any(color["vignetting"]) or color["width"] != camera["width"]
     lines = [("colour as recorded", _camera(color))] if is_other else []
     if "depth" in recorded:
         lines.append(("depth camera", _camera(recorded["depth"]) + ", registered to colour"))

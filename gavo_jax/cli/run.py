@@ -18,6 +18,7 @@ from gavo_jax.cli.selection import (
     with_shortcuts,
     with_whole_paths,
 )
+from gavo_jax.darkness import darkness_of
 from gavo_jax.datasets.assembly import recorded_as
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.depth_unit import unit_of_file
@@ -106,6 +107,9 @@ def run(options: Run) -> int:
         write_trajectories(trajectory, folder.path, trajectory_formats)
     for line in _doubts(trajectory, truth, unit_of_file(sequence)) if truth is not None else ():
         say(line)
+    if not (interrupted or is_rendered) and (dark := darkness_of(sequence, trajectory)) is not None and dark.is_harmful:
+        darker = f"The images' corners are {100 * dark.share:.0f} % darker than their middle"
+        say(f"{darker}, which may have drawn the motion with them. gavo calibrate finds the camera's vignetting.")
     if interrupted:
         return INTERRUPTED
     viewer.stay()

@@ -10,10 +10,11 @@ import pytest
 from small import CAMERA
 
 from gavo_jax.calibration import estimate as estimate_module
-from gavo_jax.calibration.estimate import Found, Wanted, estimate_camera, lens_vignetting
+from gavo_jax.calibration.estimate import Found, Wanted, estimate_camera
 from gavo_jax.calibration.file import write_camera_file
 from gavo_jax.calibration.pairs import Kinematics, Matched, Unknowns, evened
 from gavo_jax.calibration.scan import coarse, refine
+from gavo_jax.calibration.vignetting import lens_vignetting
 from gavo_jax.camera import vignetting_gain
 from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.cli.calibrate import calibration_of, with_total_delay

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_args
@@ -20,6 +21,7 @@ from small import CAMERA
 
 from gavo_jax import presets
 from gavo_jax.alignment.result import no_alignment
+from gavo_jax.camera import vignetting_gain
 from gavo_jax.cli import compare, options, run, view
 from gavo_jax.cli.align import in_words, rounded
 from gavo_jax.cli.usage import COMMANDS
@@ -588,6 +590,26 @@ def test_a_size_unlike_the_ground_truths_is_told(gavo, pristine, tmp_path, units
     truth = pristine / "groundtruth.txt"
     assert "times the size of" in gavo("evaluate", out / "trajectory.txt", truth).out
     assert "times the size" not in gavo("evaluate", truth, truth).out
+
+
+def test_dark_corners_are_told_and_the_camera_file_removes_them(gavo, pristine, tmp_path):
+    """They draw the motion with them, most in corridors, and every pair is ok."""
+    source, out = tmp_path / "source", tmp_path / "out"
+    shutil.copytree(pristine, source)
+    gain = vignetting_gain(replace(CAMERA, vignetting=(1.2, 0.36)))[..., None]
+    for file in images(source, "rgb"):
+        image = cv2.imread(str(file))
+        assert image is not None
+        cv2.imwrite(str(file), np.round(image / gain).astype(np.uint8))
+    words = r"The images' corners are (\d+) % darker than their middle, .* gavo calibrate finds"
+    told = re.search(words, gavo("run", source, "--output", out, *FAST).out)
+    assert told and int(told[1]) == pytest.approx(45, abs=3)
+    assert not re.search(words, gavo("run", pristine, "--output", out, *FAST).out)
+    with (source / "camera.toml").open("a") as file:
+        file.write("vignetting = [1.2, 0.36]\n")
+    assert "vignetting [1.2, 0.36]" in gavo("inspect", source).out
+    assert not re.search(words, gavo("run", source, "--output", out, *FAST).out)
+    assert view._recorded_camera(read_run(out), out) == CAMERA.rectified()
 
 
 def test_evaluate_tells_what_can_be_had(gavo, tmp_path):
