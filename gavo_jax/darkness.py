@@ -23,12 +23,13 @@ class Darkness(NamedTuple):
     """How much darker the corners are than the middle: 0 is not at all, 1 is black."""
 
     share: float
-    deviation: float
+    least: float
+    """Share that it has at least, three deviations below."""
 
     @property
     def is_harmful(self) -> bool:
         """Whether it is certainly large enough to show in the drift."""
-        return self.share - 3 * self.deviation > HARMFUL
+        return self.least > HARMFUL
 
 
 def darkness_of(sequence: Sequence, trajectory: Trajectory) -> Darkness | None:
@@ -54,16 +55,19 @@ def darkness_of(sequence: Sequence, trajectory: Trajectory) -> Darkness | None:
     found = fit_vignetting([pair for pair in pairs if pair is not None])
     if not np.isfinite(found.deviation):
         return None
-    share, more = (corner_darkness(found.value + shift, camera) for shift in (0.0, found.deviation))
-    return Darkness(share, more - share)
+    least = max(0.0, found.value - 3 * found.deviation)  # of a camera at rest, both numbers are large
+    return Darkness(corner_darkness(found.value, camera), corner_darkness(least, camera))
 
 
 def _pairs(sequence: Sequence, trajectory: Trajectory) -> Iterator[tuple[int, int, Float[np.ndarray, "4 4"]]]:
     """Yield pairs of frames of one segment, with the motion from the first to the second."""
     poses, segments = trajectory.world_T_camera, trajectory.segments
-    places = np.abs(sequence.timestamps[:, None] - trajectory.timestamps).argmin(axis=0)
+
+    def place(pose: int) -> int:
+        return int(np.abs(sequence.timestamps - trajectory.timestamps[pose]).argmin())
+
     for end in np.unique(np.linspace(APART, len(poses) - 1, PAIRS).astype(int)) if len(poses) > APART else ():
         start = end - APART
         motion = np.linalg.inv(poses[end]) @ poses[start]
         if segments[start] == segments[end] and np.isfinite(motion).all():
-            yield int(places[start]), int(places[end]), motion
+            yield place(start), place(end), motion

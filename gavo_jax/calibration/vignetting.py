@@ -25,7 +25,7 @@ FEWEST_BLOCKS, FEWEST_PAIRS = 200, 6
 ROUNDS = 6
 """Rounds of re-weighting."""
 LEAST = -0.3
-"""Smallest a, of a lens whose corners are bright."""
+"""Smallest a r², of a lens whose corners are bright."""
 
 
 class Blocks(NamedTuple):
@@ -90,13 +90,14 @@ def fit_vignetting(pairs: list[Seen]) -> Minimum:
     amount, deviation = 0.0, np.inf
     if len(pairs) < FEWEST_PAIRS:
         return Minimum(amount, deviation)
+    farthest = max(float(np.max([*pair.before, *pair.after])) for pair in pairs)
     for _ in range(ROUNDS):
         steps, information = np.array([_step(pair, amount) for pair in pairs]).T
         spread = 1.48 * np.median(np.abs(steps - np.median(steps))) + 1e-9
         weights = information / (1 + ((steps - np.median(steps)) / (2 * spread)) ** 2)
         step = float(np.sum(weights * steps) / weights.sum())
         deviation = float(np.sqrt(np.sum((weights * (steps - step)) ** 2)) / weights.sum())
-        amount = max(amount + step, LEAST)
+        amount = max(amount + step, LEAST / farthest)
     return Minimum(amount, deviation)
 
 

@@ -90,6 +90,39 @@ def test_a_run_shows_how_dark_its_corners_are(amount: float) -> None:
     assert found.is_harmful == (amount > 0)
 
 
+def test_a_camera_at_rest_shows_nothing() -> None:
+    """Noise alone asks for any lens, with as large a deviation."""
+    sequence: Any = Darkened(0.8)
+    still = replace(WALK[0], grey=sequence[0].grey)
+    rng = np.random.default_rng(0)
+
+    def noisy(index: int) -> Frame:
+        noise = rng.normal(0, 2, still.grey.shape)
+        return replace(still, grey=np.clip(still.grey + noise, 0, 255).astype(np.uint8), timestamp=float(index))
+
+    class Resting(Darkened):
+        def __getitem__(self, index: int) -> Frame:
+            return noisy(index)
+
+    poses = np.tile(np.eye(4), (len(WALK), 1, 1))
+    poses[:, :3, 3] = rng.normal(0, 2e-4, (len(WALK), 3))
+    resting: Any = Resting(0.8)
+    found = darkness_of(resting, Trajectory(WALK.timestamps, poses))
+    assert found is None or not found.is_harmful
+
+
+@pytest.mark.parametrize("amount", [-0.4, 1.0])
+def test_a_wide_lens_keeps_light_positive(amount: float) -> None:
+    """Far off the axis a bright corner had a light below zero."""
+    rng = np.random.default_rng(3)
+    pairs = []
+    for _ in range(8):
+        before, after = rng.uniform(0, 8, (2, 400))
+        model = np.log(np.maximum(1 + amount * before, 0.01) / np.maximum(1 + amount * after, 0.01))
+        pairs.append(Seen(2 * model, before, after))
+    assert np.isfinite(fit_vignetting(pairs).value)
+
+
 def test_what_the_camera_says_is_no_longer_there() -> None:
     sequence: Any = Darkened(0.8)
     sequence.camera = replace(CAMERA, vignetting=lens_vignetting(0.8))
