@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from gavo_jax.calibration.darkness import darkness_of
 from gavo_jax.cli.map_file import check_map_options, save_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.readiness import be_ready
@@ -18,7 +19,6 @@ from gavo_jax.cli.selection import (
     with_shortcuts,
     with_whole_paths,
 )
-from gavo_jax.darkness import darkness_of
 from gavo_jax.datasets.assembly import recorded_as
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.depth_unit import unit_of_file

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from small import CAMERA, Rendered
 
+from gavo_jax.calibration.darkness import darkness_of
 from gavo_jax.calibration.vignetting import (
     FEWEST_PAIRS,
     Blocks,
@@ -17,7 +18,6 @@ from gavo_jax.calibration.vignetting import (
     seen_twice,
 )
 from gavo_jax.camera import vignetting_gain
-from gavo_jax.darkness import darkness_of
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.trajectory import Trajectory
 
