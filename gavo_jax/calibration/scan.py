@@ -12,6 +12,8 @@ Score = Callable[[float], tuple[Float[np.ndarray, " pairs"], Bool[np.ndarray, " 
 BLOCK = 5
 """Number of consecutive pairs that the bootstrap draws together, as they share their motion and scene."""
 DRAWS = 300
+FLAT = 1e-5
+"""Rise of the mean cost over the outermost values up to which it is only rounding errors."""
 POINTS = 5
 """Number of evenly spaced values that a parabola is fitted to."""
 
@@ -68,10 +70,10 @@ def _evaluate(score: Score, values: Float[np.ndarray, " n"]) -> tuple[np.ndarray
 
 
 def _vertex(values: Float[np.ndarray, " n"], costs: Float[np.ndarray, " n"]) -> float | None:
-    """Return the minimum of the parabola fitted to some values; None if it opens downwards."""
+    """Return the minimum of the parabola fitted to some values; None if it opens downwards, or is flat."""
     unit = (values[-1] - values[0]) / 2
     curve, slope, _ = np.polyfit((values - values.mean()) / unit, costs, 2)
-    return None if curve <= 0 else float(values.mean() - unit * slope / (2 * curve))
+    return None if curve <= FLAT else float(values.mean() - unit * slope / (2 * curve))
 
 
 def _deviation(values: Float[np.ndarray, " n"], costs: Float[np.ndarray, "n pairs"]) -> float:

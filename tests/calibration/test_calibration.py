@@ -216,6 +216,8 @@ def test_a_least_comes_with_how_sure_it_is():
     flat = refine(lambda _: (rng.standard_normal(100), everywhere), 0.0, 0.1, -1, 1)
     assert flat.deviation > 0.05
     assert refine(lambda v: (np.full(100, v), everywhere), 0.0, 0.1, -1, 1).deviation == np.inf
+    rounded = refine(lambda v: (np.float32(-7.6009) + np.full(100, 5e-7 * v**2), everywhere), 0.0, 0.1, -1, 1)
+    assert rounded.deviation == np.inf, "the cost stood at its floor, and the delay was -0.0406 ± 0.002 s on any clip"
     assert refine(lambda v: (np.full(100, v), ~everywhere), 0.0, 0.1, -1, 1).deviation == np.inf
 
 
