@@ -307,15 +307,15 @@ def _judged(minima: dict[str, Minimum], trial: _Trial, interval: float, guessed:
         kind, unit, how = _KINDS[name]
         if name == "readout" and least.value >= interval:
             how += "; this is the longest possible, the time between two frames"
-        if name == "vignetting":
-            dark = corner_darkness(least.value, trial.camera)
-            how += f"; the image's corners are {100 * dark:.0f} % darker than its middle (1 would be an ideal lens)"
         if unit == "s" and guessed:
             how += f"; only as accurate as the stamps, which are a guess ({guessed})"
         scale = getattr(trial.camera, name) if kind == "focal_length" else 1.0
         deviation = float(np.hypot(least.deviation, SHARED[kind] * scale))
         if name == "vignetting" and abs(least.value) < 2 * deviation:
-            least, how = least._replace(value=0.0), "light of surfaces; no more than chance"
+            least, how = least._replace(value=0.0), f"{how}; no more than chance"
+        elif name == "vignetting":
+            dark = corner_darkness(least.value, trial.camera)
+            how += f"; the image's corners are {100 * dark:.0f} % darker than its middle (1 would be an ideal lens)"
         if least.deviation < TOO_UNSURE[kind] * scale:
             found[name] = Found(least.value, deviation, unit, how)
         else:

@@ -233,7 +233,8 @@ def camera_from_table(path: Path | str, values: Table, depth_scale: float, part:
         model=model,
         vignetting=_vignetting(f"{path}: {part}vignetting", values.get("vignetting", [])),
     )
-    _check_gain(f"{path}: {part}vignetting", camera)
+    if any(camera.vignetting):
+        _check_gain(f"{path}: {part}vignetting", camera)
     return camera
 
 
