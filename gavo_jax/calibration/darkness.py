@@ -1,6 +1,7 @@
 """How much darker the images of a run are in their corners, by its own motion."""
 
 from collections.abc import Iterator
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -42,6 +43,7 @@ def darkness_of(sequence: Sequence, trajectory: Trajectory) -> Darkness | None:
     sequence = without_distortion(sequence)
     camera = sequence.camera
 
+    @cache  # the pairs of a short run share frames
     def blocks(place: int) -> Blocks:
         frame = sequence[place]
         return Blocks.of(frame.grey, inverse_depth(frame.depth, camera), camera)

@@ -20,6 +20,8 @@ DARK, BRIGHT = 20.0, 235.0
 """Grey levels between which a block's mean is proportional to the light."""
 SAME_SURFACE = 0.05
 """Largest relative difference of a block's depth from the expected one."""
+LEAST_MOTION = 0.003
+"""Smallest spread of the change of r² in a pair, two pixels of 640 or so: what moved less, noise moves as much."""
 FEWEST_BLOCKS, FEWEST_PAIRS = 200, 6
 """Fewest blocks that a pair needs, and fewest pairs."""
 ROUNDS = 6
@@ -63,7 +65,7 @@ class Seen(NamedTuple):
 
 
 def seen_twice(reference: Blocks, target: Blocks, target_T_reference: Float[np.ndarray, "4 4"]) -> Seen | None:
-    """Match the blocks of two frames by the motion between them; None if they are too few."""
+    """Match the blocks of two frames by the motion between them; None if they are too few, or hardly moved."""
     camera, light = reference.camera, reference.light
     known = (reference.inverse_depth > 0) & (light > DARK) & (light < BRIGHT)
     if np.count_nonzero(known) < FEWEST_BLOCKS:
@@ -82,7 +84,8 @@ def seen_twice(reference: Blocks, target: Blocks, target_T_reference: Float[np.n
     same = inside & (np.abs(expected - 1) < SAME_SURFACE) & (there > DARK) & (there < BRIGHT)
     if np.count_nonzero(same) < FEWEST_BLOCKS:
         return None
-    return Seen(np.log(there[same] / light[same]), (x**2 + y**2)[same], (to_x**2 + to_y**2)[same])
+    before, after = (x**2 + y**2)[same], (to_x**2 + to_y**2)[same]
+    return Seen(np.log(there[same] / light[same]), before, after) if np.std(after - before) > LEAST_MOTION else None
 
 
 def fit_vignetting(pairs: list[Seen]) -> Minimum:

@@ -33,6 +33,7 @@ class Darkened:
         self.camera, self.timestamps, self.ground_truth = WALK.camera, WALK.timestamps, WALK.ground_truth
         self.gain = vignetting_gain(replace(CAMERA, vignetting=lens_vignetting(amount)))
         self.unreadable = unreadable
+        self.frames = [WALK[index] for index in range(len(WALK))]
 
     def __len__(self) -> int:
         return len(WALK)
@@ -40,7 +41,7 @@ class Darkened:
     def __getitem__(self, index: int) -> Frame:
         if index in self.unreadable:
             raise FrameError("torn")
-        frame = WALK[index]
+        frame = self.frames[index]
         return replace(frame, grey=np.round(frame.grey / self.gain).astype(np.uint8))
 
 
@@ -71,11 +72,14 @@ def test_pairs_of_a_wrong_motion_do_not_decide() -> None:
 def test_blocks_that_are_hidden_or_saturated_are_not_compared() -> None:
     grey, near = np.full((120, 160), 100.0), np.full((120, 160), 0.5)
     blocks, still = Blocks.of(grey, near, CAMERA), np.eye(4)
-    both = seen_twice(blocks, blocks, still)
-    assert both is not None and len(both.change) == 60 * 80 and not both.change.any()
-    assert seen_twice(blocks, Blocks.of(grey, 1.5 * near, CAMERA), still) is None
-    assert seen_twice(blocks, Blocks.of(grey + 150, near, CAMERA), still) is None
-    assert seen_twice(Blocks.of(grey, 0 * near, CAMERA), blocks, still) is None
+    aside = np.eye(4)
+    aside[0, 3] = 0.06
+    both = seen_twice(blocks, blocks, aside)
+    assert both is not None and 59 * 78 <= len(both.change) <= 60 * 80 and np.abs(both.change).max() < 1e-6
+    assert seen_twice(blocks, blocks, still) is None
+    assert seen_twice(blocks, Blocks.of(grey, 1.5 * near, CAMERA), aside) is None
+    assert seen_twice(blocks, Blocks.of(grey + 150, near, CAMERA), aside) is None
+    assert seen_twice(Blocks.of(grey, 0 * near, CAMERA), blocks, aside) is None
     away = np.diag([-1.0, 1.0, -1.0, 1.0])
     assert seen_twice(blocks, blocks, away) is None
 
@@ -90,24 +94,17 @@ def test_a_run_shows_how_dark_its_corners_are(amount: float) -> None:
     assert found.is_harmful == (amount > 0)
 
 
-def test_a_camera_at_rest_shows_nothing() -> None:
-    """Noise alone asks for any lens, with as large a deviation."""
-    sequence: Any = Darkened(0.8)
-    still = replace(WALK[0], grey=sequence[0].grey)
-    rng = np.random.default_rng(0)
-
-    def noisy(index: int) -> Frame:
-        noise = rng.normal(0, 2, still.grey.shape)
-        return replace(still, grey=np.clip(still.grey + noise, 0, 255).astype(np.uint8), timestamp=float(index))
-
-    class Resting(Darkened):
-        def __getitem__(self, index: int) -> Frame:
-            return noisy(index)
-
+@pytest.mark.parametrize("seed", range(8))
+def test_a_camera_at_rest_shows_nothing(seed: int) -> None:
+    """Noise alone asked for any lens: pairs that share a frame share its noise, and seemed to agree (seed 4)."""
+    rng = np.random.default_rng(seed)
+    still, shape = WALK[0], WALK[0].grey.shape
+    sequence: Any = Darkened(0.0)
+    noisy = [np.clip(still.grey + rng.normal(0, 2, shape), 0, 255).astype(np.uint8) for _ in range(len(WALK))]
+    sequence.frames = [replace(still, grey=grey) for grey in noisy]
     poses = np.tile(np.eye(4), (len(WALK), 1, 1))
     poses[:, :3, 3] = rng.normal(0, 2e-4, (len(WALK), 3))
-    resting: Any = Resting(0.8)
-    found = darkness_of(resting, Trajectory(WALK.timestamps, poses))
+    found = darkness_of(sequence, Trajectory(WALK.timestamps, poses))
     assert found is None or not found.is_harmful
 
 
