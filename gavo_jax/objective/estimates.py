@@ -83,10 +83,15 @@ def lit_in_both(r: Residuals) -> Float[Array, "*n"]:
 
 def estimate_scales(r: Residuals, depth_weight: jax.Array | float) -> Scales:
     """Estimate the scales of the grey and depth residuals of one motion; the weight of depth is as given."""
+    found = jnp.maximum(measured_scales(r), jnp.array([SMALLEST_GREY_SCALE, SMALLEST_DEPTH_SCALE]))
+    return Scales(found[0], found[1], jnp.float32(depth_weight))
+
+
+def measured_scales(r: Residuals) -> Float[Array, "2"]:
+    """Return the scales of the grey and depth residuals of one motion, without lower bounds."""
     residual = jnp.stack([r.grey, r.depth]).reshape(2, -1)
     mask = jnp.stack([lit_in_both(r), r.depth_valid]).reshape(2, -1)
-    found = jnp.maximum(_t_scales(residual, mask), jnp.array([SMALLEST_GREY_SCALE, SMALLEST_DEPTH_SCALE]))
-    return Scales(found[0], found[1], jnp.float32(depth_weight))
+    return _t_scales(residual, mask)
 
 
 class Brightness(NamedTuple):

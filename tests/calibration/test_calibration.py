@@ -12,7 +12,7 @@ from small import CAMERA
 from gavo_jax.calibration import estimate as estimate_module
 from gavo_jax.calibration.estimate import Found, Wanted, estimate_camera
 from gavo_jax.calibration.file import write_camera_file
-from gavo_jax.calibration.pairs import Kinematics, Matched, Unknowns, evened
+from gavo_jax.calibration.pairs import Kinematics, Matched, Unknowns, depth_moved, evened, smoothed_depth
 from gavo_jax.calibration.scan import coarse, refine
 from gavo_jax.calibration.vignetting import lens_vignetting
 from gavo_jax.camera import vignetting_gain
@@ -71,6 +71,27 @@ def test_shutter_delay_and_lens_are_found_from_the_images():
     assert readout.value == pytest.approx(READOUT, abs=0.003), readout
     assert delay.value == pytest.approx(DELAY, abs=0.003), delay
     assert estimate.camera.readout == readout.value and estimate.depth_delay == delay.value
+
+
+def test_a_delay_is_found_in_a_large_room() -> None:
+    """The depth residuals' scale stood at the lower bound that searches keep to, whatever the delay."""
+    shaken: Any = Shaken()
+    shaken.camera = replace(
+        shaken.camera, readout=READOUT, fx=CAMERA.fx, fy=CAMERA.fy, depth_scale=CAMERA.depth_scale / 8
+    )
+    delay: Any = estimate_camera(shaken, ("depth_delay",), rounds=1).found["depth_delay"]
+    assert delay.value == pytest.approx(DELAY, abs=0.003), delay
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.25, 0.5])
+def test_depth_is_smoothed_by_the_same_wherever_it_is_moved(shift: float) -> None:
+    """By linear interpolation it was smoothed least at a delay of 0, and seemed to agree least there."""
+    noise = np.random.default_rng(0).normal(0.0, 1e-3, (CAMERA.height, CAMERA.width))
+    depth = jnp.asarray(0.5 + noise, jnp.float32)
+    move = jnp.eye(4).at[:2, 3].set(shift / np.array([CAMERA.fx, CAMERA.fy]) / 0.5)
+    moved = np.asarray(depth_moved(smoothed_depth(depth), CAMERA, move))[4:-4, 4:-4]
+    assert moved.mean() == pytest.approx(0.5, abs=1e-4)
+    assert moved.std() / 1e-3 == pytest.approx(0.3, abs=0.01)
 
 
 @pytest.mark.parametrize("amount", [0.0, 0.8])
