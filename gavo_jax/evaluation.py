@@ -228,7 +228,8 @@ def _relative_pose_error_seconds(estimate: Trajectory, truth: Trajectory, delta:
         )
     nearest = _closest_index(truth.timestamps, estimate.timestamps)
     estimate = _in_segments_of_both(estimate, truth.segments[nearest])
-    far = np.abs(truth.timestamps[nearest] - estimate.timestamps) > 2 * np.median(np.diff(truth.timestamps))
+    farthest = min(2 * float(np.median(np.diff(truth.timestamps))), MAX_DIFFERENCE)
+    far = np.abs(truth.timestamps[nearest] - estimate.timestamps) > farthest
     covered = ~far[start] & ~far[end] & (estimate.segments[start] == estimate.segments[end])
     start, end = start[covered], end[covered]
     if len(start) == 0:
@@ -236,7 +237,8 @@ def _relative_pose_error_seconds(estimate: Trajectory, truth: Trajectory, delta:
     estimated, true = estimate.world_T_camera, truth.world_T_camera[nearest]
     end_T_start = inverse(estimated[end]) @ estimated[start]
     true_end_T_start = inverse(true[end]) @ true[start]
-    definition = f"inv(est_j_T_i) @ true_j_T_i over {delta:g} s (TUM evaluate_rpe.py, fixed delta), nearest true stamps"
+    span = f"{delta:g} s (TUM evaluate_rpe.py, fixed delta)"
+    definition = f"inv(est_j_T_i) @ true_j_T_i over {span}, nearest true stamps within {MAX_DIFFERENCE:g} s"
     error = inverse(end_T_start) @ true_end_T_start
     return _relative_pose_error(error, estimate.timestamps[start], definition, delta, "s")
 

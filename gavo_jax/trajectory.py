@@ -29,6 +29,9 @@ from gavo_jax.se3 import is_rigid
 MAX_GAP = 0.1
 """Longest stretch between two samples, in seconds, that `Trajectory.interpolate` bridges unless told otherwise."""
 
+SAME_PLACE = 1e-3
+"""Distance in metres up to which two poses of one stamp are the same but for rounding."""
+
 MAX_MAGNITUDE = 1e9
 """Largest absolute translation (metres) or quaternion component that a trajectory file may hold."""
 
@@ -150,7 +153,8 @@ class Trajectory:
         If a comment or a first row names the columns with qw before qx, as EuRoC's does, quaternions are read in that
         order. A comment of `segment_comment` begins a segment. Rows are sorted by their stamps; of rows with equal
         stamps the first is kept. Quaternions are normalised. Rows with a zero quaternion or numbers that are not finite
-        are left out, as trackers write them where they lost their markers. A `GavoWarning` says how many.
+        are left out, as trackers write them where they lost their markers. A `GavoWarning` says how many, and how many
+        rows of equal stamps are at different places.
 
         Raises:
             GavoError: unreadable or empty file, or a row (named as file:line) that is malformed or absurdly large; no
@@ -174,7 +178,13 @@ class Trajectory:
         table = np.array(rows)
         if order == W_FIRST_ORDER or W_FIRST.search(text):
             table[:, 4:] = np.roll(table[:, 4:], -1, axis=1)
-        _, first = np.unique(table[:, 0], return_index=True)
+        _, first, kept = np.unique(table[:, 0], return_index=True, return_inverse=True)
+        apart = np.linalg.norm(table[:, 1:4] - table[first[kept.reshape(-1)], 1:4], axis=1)
+        if elsewhere := np.count_nonzero(apart > SAME_PLACE):
+            line = (
+                f"{path}: {elsewhere} of {len(parsed)} rows left out: an earlier row has their stamp and another place"
+            )
+            warnings.warn(line, GavoWarning, stacklevel=2)
         table = table[first]
         world_T_camera = np.zeros((len(table), 4, 4))
         world_T_camera[:, :3, :3] = rotation_from_quaternion(table[:, 4:])

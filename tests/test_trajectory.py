@@ -111,7 +111,7 @@ def test_evo_reads_our_files(tmp_path):
 def test_rows_are_sorted_comments_skipped_and_quaternions_normalised(tmp_path):
     path = tmp_path / "t.txt"
     path.write_text(
-        "# head\n\n2.0 4 5 6 0 0 2 0 # no more\n".replace(" # no more", "") + "1.0,1,2,3,0,0,0,3\n1.0 9 9 9 0 0 0 1\n"
+        "# head\n\n2.0 4 5 6 0 0 2 0 # no more\n".replace(" # no more", "") + "1.0,1,2,3,0,0,0,3\n1.0 1 2 3 1 0 0 0\n"
     )
     trajectory = Trajectory.read_tum(path)
     np.testing.assert_array_equal(trajectory.timestamps, [1, 2])
@@ -154,6 +154,15 @@ def test_rows_without_a_pose_are_left_out_and_counted(tmp_path, none):
     with pytest.warns(GavoWarning, match=r"t\.txt: 1 of 3 rows left out: .*not finite"):
         trajectory = Trajectory.read_tum(path)
     assert trajectory.timestamps[-1] == 3 and len(trajectory) == 2 and trajectory.segments.tolist() == [0, 1]
+
+
+def test_a_stamp_with_two_places_is_told(tmp_path):
+    """As in a log that a second run was appended to; rounding is none."""
+    path = tmp_path / "t.txt"
+    path.write_text("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n1 0 0 0.0001 0 0 0 1\n2 0 0 7 0 0 0 1\n")
+    with pytest.warns(GavoWarning, match=r"t\.txt: 1 of 4 rows left out: an earlier row has their stamp and another"):
+        trajectory = Trajectory.read_tum(path)
+    assert trajectory.world_T_camera[:, 2, 3].tolist() == [0, 0]
 
 
 def test_a_segment_of_a_number_that_no_file_has_is_a_comment(tmp_path):

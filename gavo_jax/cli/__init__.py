@@ -91,8 +91,7 @@ def _run(arguments: list[str]) -> int:
 
 @contextlib.contextmanager
 def _told_warnings() -> Iterator[None]:
-    """Print each of this package's warnings on one line; leave other warnings unchanged."""
-    show = warnings.showwarning
+    """Print each of this package's warnings on one line, also where all are errors; leave other warnings unchanged."""
 
     def show_line(message: Any, category: type[Warning], *where: Any) -> None:
         if issubclass(category, GavoWarning):
@@ -100,11 +99,10 @@ def _told_warnings() -> Iterator[None]:
         else:
             show(message, category, *where)
 
-    warnings.showwarning = show_line
-    try:
+    with warnings.catch_warnings():
+        show, warnings.showwarning = warnings.showwarning, show_line
+        warnings.simplefilter("default", GavoWarning)
         yield
-    finally:
-        warnings.showwarning = show
 
 
 def _open_streams() -> None:

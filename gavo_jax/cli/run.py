@@ -135,9 +135,10 @@ def _start(options: Run, sequence: Sequence, folder: RunFolder, config: dict[str
     """Start the files of a run, replacing an earlier run's."""
     if options.resume:
         say(f"nothing to resume in {folder.path}: starting a new run")
-    if folder.has_run():
-        say(f"the earlier run in {folder.path} is replaced")
+    had_run = folder.has_run()
     folder.start(config, float(sequence.timestamps[0]))
+    if had_run:
+        say(f"the earlier run in {folder.path} is replaced")
     remove_trajectories(folder.path)
 
 

@@ -133,7 +133,7 @@ def _sources(place: Place) -> str | None:
     names = [child.name for child in place.inside if not child.name.startswith(".") and place.is_source(child)]
     if not names:
         return None
-    there = f"{len(names)}: pass one of {_listed(names)}" if len(names) > 1 else f"one: pass {names[0][:60]}"
+    there = f"{len(names)}: pass one of {_listed(names)}" if len(names) > 1 else f"one: pass {place.path / names[0]}"
     return f"not a source itself, but a folder of {there}"
 
 
@@ -181,7 +181,7 @@ def _part_of_source(place: Place) -> str | None:
 
 def _further_down(place: Place) -> str | None:
     found = next((inner for inner in islice(_further(place), LOOKED_INTO) if place.is_source(inner)), None)
-    return found and f"not a source itself, but contains one: pass {found.relative_to(place.path)}"
+    return found and f"not a source itself, but contains one: pass {found}"
 
 
 def _further(place: Place) -> Iterator[Path]:

@@ -77,8 +77,9 @@ def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
             sequence = part.open()
         except GavoError as error:
             raise GavoError(f"{path}: {one_line(error)}") from None
+        frames = frames_of(part.name, sequence)
         for variant in variants:
-            runs += _runs(part, sequence, variant)
+            runs += _runs(part, sequence, frames, variant)
     names = [part.name for part in parts]
     for variant in variants:
         refuse_unknown(f"{path}: printed figures of {variant.label}", variant.printed, (*names, *skipped))
@@ -104,6 +105,8 @@ def parts_of(path: Path, table: Mapping[str, Any]) -> tuple[list[Part], dict[str
         refuse_unknown(place, entry, SEQUENCE_KEYS)
         patterns = entry.get("path", SYNTHETIC)
         patterns = [text_of(f"{place}: path", p) for p in (patterns if isinstance(patterns, list) else [patterns])]
+        if not patterns:
+            raise GavoError(f"{place}: path: an empty list")
         found = _find(path.parent, patterns)
         if not found:
             line = f"{one_line(', '.join(patterns))}: no such folder here, beside {path.name}, or in {DATA}"
@@ -127,10 +130,10 @@ def _find(beside: Path, patterns: Sequence[str]) -> list[str]:
         if pattern == SYNTHETIC:
             return [SYNTHETIC]
         for root in roots:
-            found = sorted(
-                match for match in glob.glob(os.path.join(glob.escape(root), pattern)) if os.path.isdir(match)
-            )
-            if found:
+            if os.path.isdir(exact := os.path.join(root, pattern)):  # its name may have brackets
+                return [exact]
+            matches = glob.glob(os.path.join(glob.escape(root), pattern))
+            if found := sorted(filter(os.path.isdir, matches)):
                 return found
     return []
 
@@ -204,6 +207,8 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
     for name, values in swept.items():
         if not isinstance(values, list) or not values:
             raise GavoError(f"{place}: sweep.{one_line(name)}: not a list of values")
+        if name in fixed:
+            raise GavoError(f"{place}: sweep.{one_line(name)}: has a fixed value, too")
     variants = []
     for preset in names:
         for choice in itertools.product(*swept.values()):
@@ -224,8 +229,7 @@ def require_what_loops_need(place: str, settings: Settings) -> None:
         raise GavoError(f"{place}: {error}") from None
 
 
-def _runs(part: Part, sequence: FrameSequence, variant: _Variant) -> list[Run]:
-    frames = frames_of(part.name, sequence)
+def _runs(part: Part, sequence: FrameSequence, frames: dict[str, Any], variant: _Variant) -> list[Run]:
     pairs, pixels = len(sequence) - 1, sequence.camera.width * sequence.camera.height
     shared = (part, pairs, pixels, variant.method, variant.preset, variant.text)
     runs = []

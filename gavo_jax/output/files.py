@@ -145,13 +145,17 @@ def remove_files(folder: Path, *names: str) -> None:
             raise GavoError(f"{path}: cannot be replaced: {error.strerror or error}") from None
 
 
+FIGURE_NAMES = tuple(f"{name}.{suffix}" for name in FIGURES for suffix in FIGURE_FORMATS)
+"""Names of all files with figures that a run may leave."""
+
+
 def remove_figures(folder: Path) -> None:
     """Remove an earlier run's figures, if there are any.
 
     Raises:
         GavoError: One cannot be removed.
     """
-    remove_files(folder, *(f"{name}.{suffix}" for name in FIGURES for suffix in FIGURE_FORMATS))
+    remove_files(folder, *FIGURE_NAMES)
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -25,6 +25,7 @@ from gavo_jax.output.files import (
     CHECKPOINT,
     COMPARISON,
     CONFIG,
+    FIGURE_NAMES,
     FRAMES,
     LOOPS,
     METRICS,
@@ -109,8 +110,12 @@ class _GrowingFile:
         return GavoError(f"{self.path}: cannot be written to: {error.strerror or error}")
 
 
-FOREIGN = ("trajectory.*", MASKS)
-"""Files that a run replaces, and that may be the user's own if the folder holds no run's configuration."""
+GROWING = (TRAJECTORY, ODOMETRY, FRAMES, BODIES, MOTIONS)
+"""Files that grow with a run, if it has them."""
+AT_ITS_END = (METRICS, CHECKPOINT, LOOPS, RECORDING, VIEW)
+"""Files that a run writes now and then, or at its end; figures and masks come on top."""
+REPLACED = ("trajectory.*", CONFIG, *GROWING, *AT_ITS_END, MASKS, *FIGURE_NAMES)
+"""What a run replaces, which is the user's own if the folder holds no run's configuration."""
 
 
 class RunFolder:
@@ -151,7 +156,7 @@ class RunFolder:
             is_of_run = "odometry" in read_json_object(self.path / CONFIG)
         except GavoError:
             is_of_run = False
-        if found := [] if is_of_run else [path for name in FOREIGN for path in sorted(self.path.glob(name))]:
+        if found := [] if is_of_run else [path for name in REPLACED for path in sorted(self.path.glob(name))]:
             raise GavoError(f"{found[0]}: is not from a run, and this run would replace it: choose another folder")
 
     def start(self, config: Mapping[str, Any], timestamp: float) -> None:
@@ -165,8 +170,7 @@ class RunFolder:
             GavoError: The folder holds files of another kind, or a file cannot be written.
         """
         self._refuse_foreign()
-        growing = (TRAJECTORY, ODOMETRY, FRAMES, BODIES, MOTIONS)
-        remove_files(self.path, METRICS, CHECKPOINT, CONFIG, LOOPS, RECORDING, VIEW, *growing)
+        remove_files(self.path, CONFIG, *AT_ITS_END, *GROWING)
         remove_figures(self.path)
         remove_masks(self.path)
         write_json(self.path / CONFIG, config)

@@ -103,6 +103,15 @@ def test_any_encoding_of_the_screen(monkeypatch, encoding, words):
     assert printed["stdout" if "--help" in words else "stderr"].strip()
 
 
+def test_a_warning_is_a_line_also_where_warnings_are_errors(tmp_path: Path, capsys: Any) -> None:
+    """As with PYTHONWARNINGS=error, or in this test: it ended in a traceback."""
+    rows = [f"{i / 10} 0 0 0 0 0 0 1" for i in range(30)]
+    for name, more in (("a.txt", ["9 nan 0 0 0 0 0 1"]), ("b.txt", [])):
+        (tmp_path / name).write_text("\n".join(rows + more))
+    assert main(["evaluate", str(tmp_path / "a.txt"), str(tmp_path / "b.txt")]) == 0
+    assert "gavo: warning: " in (told := capsys.readouterr().err) and "1 of 31 rows left out" in told, told
+
+
 def test_a_folder_that_is_closed_to_this_user_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     """`Path.is_dir` raises what no other question about a file does."""
 

@@ -125,7 +125,7 @@ def test_a_file_is_described(tmp_path: Path, name: str, words: str) -> None:
 
 def test_sources_nearby_are_named(tmp_path: Path) -> None:
     scene = made(tmp_path / "scene", "seq-01/frame-000000.color.png", "seq-01/frame-000000.depth.png")
-    with pytest.raises(GavoError, match="not a source itself, but a folder of one: pass seq-01"):
+    with pytest.raises(GavoError, match=f"not a source itself, but a folder of one: pass {scene / 'seq-01'}$"):
         open_source(scene)
     image = scene / "seq-01" / "frame-000000.color.png"
     assert source_around(image) == scene / "seq-01" and source_around(scene) is None
@@ -139,21 +139,23 @@ def test_a_source_further_down_is_named(tmp_path: Path) -> None:
     """Of a dataset's root the list of all kinds said nothing."""
     folder = made(tmp_path / "root", "notes.md", "kv1/.hidden/0.png", "kv1/sun/notes.md", "scenes/chess/rgb/0.png")
     made(folder, "scenes/chess/depth/0.png")
-    with pytest.raises(GavoError, match="root: not a source itself, but contains one: pass scenes/chess$"):
+    with pytest.raises(
+        GavoError, match=f"root: not a source itself, but contains one: pass {folder / 'scenes/chess'}$"
+    ):
         open_source(folder)
 
 
 def test_a_source_four_folders_down_is_named(tmp_path: Path) -> None:
     """As BlenderProc writes its scenes."""
     folder = made(tmp_path / "output", *(f"bop_data/set/train_pbr/000000/{kind}/0.png" for kind in ("rgb", "depth")))
-    with pytest.raises(GavoError, match="contains one: pass bop_data/set/train_pbr/000000$"):
+    with pytest.raises(GavoError, match=f"contains one: pass {folder / 'bop_data/set/train_pbr/000000'}$"):
         open_source(folder)
 
 
 def test_a_link_in_a_circle_is_passed_over(tmp_path: Path) -> None:
     folder = made(tmp_path / "there", "notes.md", "seq-01/frame-000000.color.png", "seq-01/frame-000000.depth.png")
     (folder / "circle").symlink_to("circle")
-    with pytest.raises(GavoError, match="not a source itself, but a folder of one: pass seq-01"):
+    with pytest.raises(GavoError, match=f"not a source itself, but a folder of one: pass {folder / 'seq-01'}$"):
         open_source(folder)
 
 

@@ -95,6 +95,12 @@ def test_a_dataset_of_ones_own_need_not_be_hashable(write_experiment, monkeypatc
     assert run.pairs == 2
 
 
+def test_a_folder_whose_name_has_brackets_is_found(tmp_path):
+    write_tum(SyntheticSequence(frames=3, camera=CAMERA), tmp_path / "scan [2]")
+    (tmp_path / "x.toml").write_text('[[sequences]]\npath = "scan [2]"\n[[methods]]\nname = "ga"\n')
+    assert [run.part.name for run in read_plan(tmp_path / "x.toml").runs] == ["scan [2]"]
+
+
 def test_globs_parts_and_missing_sequences(tmp_path, monkeypatch):
     for name in ("walk_a", "walk_b"):
         write_tum(SyntheticSequence(frames=6, camera=CAMERA), tmp_path / "data" / name)
@@ -137,6 +143,12 @@ REFUSED = {
     "unknown method": ("", '[[methods]]\nname = "gauss"', ["'gauss'", "'gauss-newton'"]),
     "unknown preset": ("", METHOD + "presets = ['quick']", ["presets", "'quick'"]),
     "unknown printed sequence": ("", METHOD + "printed.sinthetic = 1", ["'sinthetic'", "synthetic"]),
+    "fixed and swept": (
+        "",
+        METHOD + "solver.pressure = 8\nsweep.solver.pressure = [4]",
+        ["pressure", "a fixed value, too"],
+    ),
+    "no path": ("[[sequences]]\npath = []\n", METHOD, ["path: an empty list"]),
     "sweep without a list": ("", METHOD + "sweep.solver.pressure = 8", ["sweep.solver.pressure", "list"]),
     "settings of a peer": ("", '[[methods]]\nname = "opencv-rgb"\nseeds = 3', ["opencv-rgb", "'seeds'"]),
     "the same twice": ("", METHOD + METHOD, ["ga", "twice"]),

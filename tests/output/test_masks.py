@@ -84,15 +84,17 @@ def test_what_a_kill_left_half_written_goes_too(tmp_path: Path):
     assert not (tmp_path / MASKS).exists()
 
 
-@pytest.mark.parametrize("name", ["masks/0001.png", "trajectory.csv"])
+OWN = ("masks/0001.png", "trajectory.csv", "config.json", "metrics.json", "frames.csv", "odometry.txt", "run.rrd")
+
+
+@pytest.mark.parametrize("name", [*OWN, "loops.csv", "bodies.csv", "trajectory.png"])
 def test_a_run_replaces_no_files_that_a_run_did_not_leave(tmp_path: Path, name: str):
-    """A dataset's masks were taken for an earlier run's, and removed."""
-    for file in (name, "config.json"):
-        (tmp_path / file).parent.mkdir(exist_ok=True)
-        (tmp_path / file).write_text("{}")
+    """A dataset's masks, and anybody's frames.csv, were taken for an earlier run's, and removed."""
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("{}")
     with RunFolder(tmp_path) as folder, pytest.raises(GavoError, match="is not from a run"):
         folder.start({"odometry": OdometryOptions()}, 0.0)
-    assert (tmp_path / name).exists()
+    assert (tmp_path / name).read_text() == "{}"
     (tmp_path / "config.json").write_text('{"odometry": {}}')
     with RunFolder(tmp_path) as folder:
         folder.start({"odometry": OdometryOptions()}, 0.0)

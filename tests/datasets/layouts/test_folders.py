@@ -825,13 +825,13 @@ def test_what_is_no_source_says_what_is_there(tmp_path):
     with pytest.raises(GavoError, match=r"notes\.txt: a file of 5 bytes"):
         open_source(tmp_path / "notes.txt")
     (tmp_path / "walk.bag").write_bytes(b"")
-    with pytest.raises(GavoError, match=r"not a source itself, but a folder of one: pass walk\.bag"):
+    with pytest.raises(GavoError, match=r"not a source itself, but a folder of one: pass .*/walk\.bag$"):
         open_source(tmp_path)
     (tmp_path / "walk.bag").unlink()
     LAYOUTS["replica"][1](tmp_path / "room0")
     with pytest.raises(GavoError, match=r"traj\.txt: a file inside a source: pass its folder, .*room0$"):
         open_source(tmp_path / "room0/traj.txt")
-    with pytest.raises(GavoError, match=r"not a source itself, but a folder of one: pass room0"):
+    with pytest.raises(GavoError, match=r"not a source itself, but a folder of one: pass .*/room0$"):
         open_source(tmp_path)
 
 
