@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import small
@@ -11,11 +12,14 @@ from driving import SEARCH_ALONE, SOLVER, Altered
 from small import Rendered
 
 from gavo_jax.datasets.base import Frame
+from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.attached import MOVES, Attached
 from gavo_jax.odometry.overlays import AsTracked, Overlays
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.odometry.stream import track
+from gavo_jax.se3 import exp
 from gavo_jax.settings import Settings
+from gavo_jax.trajectory import Trajectory
 
 FRAMES = 60
 ROOM = Rendered(FRAMES, camera=small.CAMERA, speed=3.0)
@@ -59,6 +63,19 @@ def test_nothing_is_known_before_the_camera_has_moved() -> None:
 def test_a_scene_is_not_attached(speed: float) -> None:
     room = Rendered(FRAMES, camera=small.CAMERA, speed=speed, seed=1)
     assert not seen(room, room.ground_truth.world_T_camera).edges.any()  # pyright: ignore[reportOptionalMemberAccess]
+
+
+@pytest.mark.parametrize(("amplitude", "period"), [(0.01, 6), (0.01, 15), (0.014, 6)])
+def test_the_scene_before_a_camera_that_trembles_is_not_attached(amplitude: float, period: int) -> None:
+    """All of the image was left out, and the run was blank to its end."""
+    start, poses = POSES[0], []
+    for i in range(130):
+        turn = amplitude * np.array([np.cos(2 * np.pi * i / period), np.sin(2 * np.pi * i / period), 0.0])
+        poses.append(start @ np.asarray(exp(jnp.array([0.0, 0.0, 0.0, *turn])), np.float64))
+    path = Trajectory(np.arange(130) / 30, np.stack(poses))
+    shaken = SyntheticSequence(130, camera=small.CAMERA, trajectory=path)
+    attached = seen(shaken, poses)
+    assert attached.moves >= MOVES and not attached.edges.any()
 
 
 def test_edges_along_the_motion_are_not_attached() -> None:
