@@ -179,6 +179,7 @@ class Camera:
         if self.is_rectified:
             return image
         self._check_size(image)
+        image = _in_own_order(image)
         if self.is_distorted:
             coordinates, fractions, _ = _undistortion_maps(self._on_host())
             image = cv2.remap(image, coordinates, fractions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -200,6 +201,7 @@ class Camera:
         if not self.is_distorted:
             return depth
         self._check_size(depth)
+        depth = _in_own_order(depth)
         _, _, nearest = _undistortion_maps(self._on_host())
         none = np.empty(0, np.float32)
         return cv2.remap(depth, nearest, none, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
@@ -284,9 +286,16 @@ def require_camera(camera: Camera) -> None:
         )
     if not (isinstance(camera.vignetting, tuple) and all(map(_is_number, camera.vignetting))):
         raise GavoError(f"camera: vignetting: expected a tuple of numbers, got {camera.vignetting!r}")
+    if any(camera.vignetting) and (doubt := doubt_about_gain(camera)):
+        raise GavoError(f"camera: vignetting: {doubt}")
     if min(camera.width, camera.height) < MIN_SIDE:
         size = f"{camera.width}x{camera.height}"
         raise GavoError(f"images of {size} are too small: the search needs at least {MIN_SIDE} pixels per side")
+
+
+def _in_own_order(image: np.ndarray) -> np.ndarray:
+    """An image in the machine's byte order, as OpenCV reads any."""
+    return image if image.dtype.isnative else image.astype(image.dtype.newbyteorder("="))
 
 
 def _is_number(value: Any) -> bool:
@@ -305,6 +314,8 @@ def _stack(*arrays: Any) -> Any:
 @lru_cache(maxsize=8)
 def _reach(distortion: tuple[float, ...], model: str) -> float:
     """Compute `Camera.reach`: where the radius in the image stops growing, by the radial terms alone."""
+    if not distortion:
+        return float("inf")
     off = np.linspace(0, *OFF_AXIS)
     if model == "fisheye":
         angle = np.arctan(off)
@@ -339,6 +350,20 @@ def vignetting_gain(camera: Camera) -> Float[np.ndarray, "height width"]:
     """Return the factor by which each pixel of an undistorted image is brightened."""
     x, y = to_ray(camera, np.arange(camera.width), np.arange(camera.height)[:, None])
     return np.polyval([*camera.vignetting[::-1], 1.0], x**2 + y**2).astype(np.float32)
+
+
+LEAST_GAIN, MOST_GAIN = 0.5, 10.0
+"""Smallest and largest factor by which vignetting is undone."""
+
+
+def doubt_about_gain(camera: Camera) -> str:
+    """Return why the coefficients of vignetting must be meant for another unit of radius, pixels say; else nothing."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        gain = vignetting_gain(camera._on_host())
+    if gain.min() >= LEAST_GAIN and gain.max() <= MOST_GAIN:
+        return ""
+    spread = f"multiplies parts of the image by {gain.min():.3g} to {gain.max():.3g}"
+    return f"{spread}, more than a lens does; is r the tangent of the angle to the axis?"
 
 
 NAMES_OF_SEQUENCES = {

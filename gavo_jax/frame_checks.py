@@ -137,7 +137,10 @@ def check_frame(
     """
     late = _check_timestamp(frame, timestamp, history)
     if late.use is Use.NOTHING:
-        return _doubt(late, history)
+        finding, history = _doubt(late, history)
+        if history.timestamp is None and math.isfinite(timestamp):  # the clock was set back: it goes on from here
+            history = history._replace(timestamp=timestamp)
+        return finding, history
     history = _with_timestamp(history, timestamp)
     if not isinstance(frame, Frame) or any(
         np.shape(image) != (camera.height, camera.width) for image in (frame.grey, frame.depth)

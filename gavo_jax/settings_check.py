@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any, Literal
 
+import jax
 import numpy as np
 from jax.core import Tracer
 
@@ -54,6 +55,7 @@ def require_settings(settings: Any, place: str = "settings") -> None:
         part, kind = getattr(settings, room.name), kind_of(type(settings), room.name)
         if isinstance(part, type) or not isinstance(part, kind):
             raise GavoError(f"{place}: {room.name}: must be of type {kind.__name__}, not {shown(part)}")
+    _require_pytree(f"{place}: solver", settings.solver)
     for name, part, field in _fields(settings):
         _require_kind(f"{place}: {name}", getattr(part, field.name), kind_of(type(part), field.name), field.default)
     if fault := fault_of_loss(settings.alignment.loss):
@@ -86,6 +88,12 @@ def alternatives(kind: Any) -> tuple[Any, ...]:
 def is_whole(value: Any) -> bool:
     """Whether a field with this default takes whole numbers."""
     return all(isinstance(entry, int) for entry in (value if isinstance(value, tuple) else (value,)))
+
+
+def _require_pytree(where: str, solver: Any) -> None:
+    if any(leaf is solver for leaf in jax.tree.leaves(solver)):
+        words = "is not a pytree: decorate it with @jax.tree_util.register_dataclass"
+        raise GavoError(f"{where}: {type(solver).__name__} {words}")
 
 
 def _fields(settings: Any) -> Iterator[tuple[str, Any, dataclasses.Field[Any]]]:

@@ -28,6 +28,8 @@ from gavo_jax.se3 import is_rigid
 
 MAX_GAP = 0.1
 """Longest stretch between two samples, in seconds, that `Trajectory.interpolate` bridges unless told otherwise."""
+ROUNDED = 1.01
+"""Ratio up to which a stretch is as long as another: stamps are rounded."""
 
 SAME_PLACE = 1e-3
 """Distance in metres up to which two poses of one stamp are the same but for rounding."""
@@ -249,8 +251,9 @@ class Trajectory:
         right = np.clip(np.searchsorted(times, timestamps), 0, len(times) - 1)
         left = np.where(times[right] == timestamps, right, np.maximum(right - 1, 0))
         gap = times[right] - times[left]
-        valid = (times[left] <= timestamps) & (timestamps <= times[right]) & (gap <= max_gap)
-        valid &= segments[left] == segments[right]
+        valid = (times[left] <= timestamps) & (timestamps <= times[right]) & (gap <= ROUNDED * max_gap)
+        known = np.isfinite(samples).all(axis=(1, 2))
+        valid &= (segments[left] == segments[right]) & known[left] & known[right]
         fraction = np.divide(timestamps - times[left], gap, out=np.zeros_like(gap), where=gap > 0)[valid]
         start, end = samples[left[valid]], samples[right[valid]]
         between = np.zeros((len(fraction), 4, 4))

@@ -190,6 +190,18 @@ def test_undistortion_refuses_another_size():
         Camera.preset("fr1").undistort_image(np.zeros((240, 320), np.uint8))
 
 
+def test_images_of_the_other_byte_order_are_undistorted_alike():
+    """Depth of 5000 became 34835."""
+    camera = replace(Camera.preset("fr1"), vignetting=(0.3,))
+    raw = np.random.default_rng(0).integers(3000, 6000, (480, 640)).astype(np.uint16)
+    for undistort in (camera.undistort_depth, camera.undistort_image):
+        np.testing.assert_array_equal(undistort(raw.astype(">u2")), undistort(raw.astype("<u2")))
+
+
+def test_a_lens_without_distortion_reaches_everywhere():
+    assert Camera(500.0, 500.0, 319.5, 239.5, 640, 480, distortion=()).reach == np.inf
+
+
 def test_undistortion_agrees_with_opencv():
     camera = Camera.preset("fr1")
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
@@ -314,6 +326,8 @@ def test_no_camera_file_raises_anything_else(tmp_path_factory, content, suffix):
         ({"cx": "80"}, "cx: expected a number"),
         ({"width": 160.0}, "width: expected a whole number"),
         ({"width": 8}, "too small"),
+        ({"vignetting": (-10.0,)}, "vignetting: multiplies parts of the image by -"),
+        ({"vignetting": (1e300,)}, "vignetting: multiplies parts"),
         ({"depth_scale": 0.0}, "depth_scale: expected a positive number"),
         ({"readout": -0.02}, "readout: expected seconds of at least 0"),
         ({"distortion": [0.1, 0.0, 0.0, 0.0]}, "distortion: expected a tuple of 4, 5, 8, 12, 14 numbers"),

@@ -152,6 +152,19 @@ def test_what_lasts_becomes_usual(frames, seen, name):
     assert all(finding.use is Use.ALL for finding in rest)
 
 
+@pytest.mark.parametrize("first", [0.0, 1e300])
+def test_stamps_that_stay_the_same_are_never_usual(frames, first):
+    """Every fourth frame with one and the same stamp was good; after a stamp far ahead frames pass again."""
+    history, uses = History(), []
+    for place, frame in enumerate(frames):
+        stamp = first if place == 0 else 0.0 if first == 0.0 else 0.03 * place
+        finding, history = check_frame(frame, stamp, CAMERA, history)
+        uses.append(finding.use)
+    later = len(frames) - 1
+    lost = later if first == 0.0 else MAX_DOUBTS
+    assert uses == [Use.ALL, *lost * [Use.NOTHING], *(later - lost) * [Use.ALL]]
+
+
 @pytest.mark.parametrize("clip", ["fr1_xyz", "fr1_desk", "fr1_rpy"])
 def test_no_false_alarms_on_real_clips(data_dir, clip):
     sequence = TumSequence(data_dir / clip)

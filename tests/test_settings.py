@@ -31,6 +31,18 @@ def test_anything_else_is_told(wrong):
         as_settings(wrong)
 
 
+def test_a_solver_that_is_no_pytree_is_told():
+    """It ended in an AttributeError of the compiler's cache."""
+
+    class Own(gavo.GaussNewton):
+        pass
+
+    with pytest.raises(
+        gavo.GavoError, match=r"solver: Own is not a pytree: decorate it with @jax\.tree_util\.register"
+    ):
+        as_settings(Own())
+
+
 def test_parts_one_by_one_still_work_and_warn():
     with pytest.warns(DeprecationWarning, match="parts of the settings"):
         found = as_settings(None, NEWTON, alignment=ROBUST, odometry=None)

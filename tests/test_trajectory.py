@@ -239,6 +239,18 @@ def test_interpolation_returns_the_samples_and_knows_its_limits():
     assert not Trajectory(np.zeros(0), np.zeros((0, 4, 4))).interpolate(stamps)[1].any()
 
 
+def test_samples_a_tenth_of_a_second_apart_are_bridged_and_unknown_ones_are_not():
+    """Of stamps that were rounded, half of the stretches were longer than 0.1 s."""
+    stamps = 1305031102 + np.round(np.arange(100) * 0.10004, 4)
+    poses = np.tile(np.eye(4), (100, 1, 1))
+    asked = np.arange(stamps[0], stamps[-1], 0.033)
+    assert Trajectory(stamps, poses).interpolate(asked)[1].all()
+    poses[50] = np.nan
+    found, valid = Trajectory(stamps, poses).interpolate(asked)
+    np.testing.assert_array_equal(valid, np.isfinite(found).all(axis=(1, 2)))
+    assert 90 < valid.sum() * 0.033 * 10 < 99
+
+
 def test_interpolation_at_one_stamp_is_one_pose():
     trajectory = random_trajectory(4, 2)
     stamps = trajectory.timestamps[:1] + 0.001

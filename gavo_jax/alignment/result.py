@@ -6,6 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from gavo_jax.errors import GavoError
 from gavo_jax.objective.estimates import Brightness, ExplainedShare
 from gavo_jax.se3 import rigid
 from gavo_jax.status import AlignmentStatus, bit
@@ -54,9 +55,17 @@ class Alignment(NamedTuple):
 
     @property
     def statuses(self) -> tuple[AlignmentStatus, ...]:
-        """Every status that holds, `status` first; only `OK` if there are no findings."""
-        others = (other for other in AlignmentStatus if int(self.findings) & bit(other) and other != self.status)
-        return (self.status, *others)
+        """Every status that holds, `status` first; only `OK` if there are no findings.
+
+        Raises:
+            GavoError: This is a batch.
+        """
+        if np.ndim(self.status):
+            words = "jax.tree.map(lambda field: field[i], batch) is its pair i"
+            raise GavoError(f"a batch of {np.shape(self.status)[0]} alignments has no single status: {words}")
+        status = AlignmentStatus(int(self.status))
+        others = (other for other in AlignmentStatus if int(self.findings) & bit(other) and other != status)
+        return (status, *others)
 
     @property
     def undetermined(self) -> str:
@@ -93,10 +102,11 @@ class Alignment(NamedTuple):
     @property
     def sentence(self) -> str:
         """The status of the result in a sentence or two."""
-        words, left_open = self.status.sentence, self.undetermined
-        if self.status is AlignmentStatus.FROZEN:
+        status, left_open = self.statuses[0], self.undetermined
+        words = status.sentence
+        if status is AlignmentStatus.FROZEN:
             words = f"The {self.frozen} repeats the last one."
-        if left_open and self.status is AlignmentStatus.LOW_TEXTURE:
+        if left_open and status is AlignmentStatus.LOW_TEXTURE:
             return f"{words[:-1]}, above all {left_open}."
         return f"{words} The images do not determine: {left_open}." if left_open else words
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.camera import DISTORTION_COUNTS, MAX_SIDE, MIN_SIDE, PRESETS, Camera, vignetting_gain
+from gavo_jax.camera import DISTORTION_COUNTS, MAX_SIDE, MIN_SIDE, PRESETS, Camera, doubt_about_gain
 from gavo_jax.camera_files.foreign import hint_of_ending
 from gavo_jax.camera_files.makes import PARSERS, PROJECTION, Table
 from gavo_jax.camera_files.words import CAMERA_KEYS, DEVICE_KEYS, MODELS, REQUIRED, model_of
@@ -33,8 +33,6 @@ MOST_K1, MOST_TANGENTIAL, MOST_RADIAL = 100.0, 1.0, 1000.0
 
 MOST_VIGNETTING = 6
 """Largest number of coefficients of vignetting."""
-LEAST_GAIN, MOST_GAIN = 0.5, 10.0
-"""Smallest and largest factor by which vignetting is undone."""
 
 DEPTH_SCALE = 5000.0
 """Default depth scale, units per metre: the TUM benchmark's."""
@@ -233,8 +231,8 @@ def camera_from_table(path: Path | str, values: Table, depth_scale: float, part:
         model=model,
         vignetting=_vignetting(f"{path}: {part}vignetting", values.get("vignetting", [])),
     )
-    if any(camera.vignetting):
-        _check_gain(f"{path}: {part}vignetting", camera)
+    if any(camera.vignetting) and (doubt := doubt_about_gain(camera)):
+        raise GavoError(f"{path}: {part}vignetting: {doubt}")
     return camera
 
 
@@ -278,14 +276,6 @@ def _vignetting(place: str, numbers: Any) -> tuple[float, ...]:
     if not isinstance(numbers, list) or len(numbers) > MOST_VIGNETTING:
         raise GavoError(f"{place}: must be a list of up to {MOST_VIGNETTING} numbers (k1 k2 …), not {_count(numbers)}")
     return tuple(_number(place, value, -MOST_RADIAL, MOST_RADIAL) for value in numbers)
-
-
-def _check_gain(place: str, camera: Camera) -> None:
-    """Refuse coefficients of vignetting that are meant for another unit of radius, pixels say."""
-    gain = vignetting_gain(camera)
-    if not (LEAST_GAIN <= gain.min() and gain.max() <= MOST_GAIN):
-        spread = f"multiplies parts of the image by {gain.min():.3g} to {gain.max():.3g}"
-        raise GavoError(f"{place}: {spread}, more than a lens does; is r the tangent of the angle to the axis?")
 
 
 def _count(numbers: Any) -> str:

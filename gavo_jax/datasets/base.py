@@ -231,5 +231,7 @@ def require_parts(sequence: Sequence) -> None:
     if np.shape(sequence.timestamps) != (len(sequence),):
         shape = np.shape(sequence.timestamps)
         raise GavoError(f"{kind}: timestamps: expected one for each of {len(sequence)} frames, got shape {shape}")
+    if (held := np.asarray(sequence.timestamps).dtype).kind not in "iuf":
+        raise GavoError(f"{kind}: timestamps: expected seconds, got {held}")
     if not isinstance(truth, Trajectory | None):
         raise GavoError(f"{kind}: ground_truth: expected a Trajectory or None, got {type(truth).__name__}")

@@ -202,7 +202,7 @@ class Odometry:
         Args:
             frame: The next frame; the error or None for one that could not be read: it is lost, and the run goes on.
             timestamp: Its colour timestamp, seconds; it overrides the frame's own. If it is not later than the last
-                one, the frame is lost.
+                one, the frame is lost. After three such frames in a row the clock counts as set back to the third.
 
         Returns:
             The step, or None for the first frame, which is the world's origin.

@@ -203,8 +203,8 @@ class RunFolder:
             _refuse_another(self.path / CONFIG, config)
         elif kept.exists() or (self.path / METRICS).exists():
             raise GavoError(
-                f"{self.path / CONFIG}: no such file, so the other files cannot be matched to a run: run again "
-                "without --resume"
+                f"{self.path / CONFIG}: no such file, so the other files cannot be matched to a run: choose another "
+                "folder"
             )
         if not kept.exists():
             return None

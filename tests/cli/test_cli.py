@@ -679,7 +679,7 @@ def test_run_is_recorded_and_viewed_again(gavo, clip, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     arguments = ("run", "clip", "--camera", "clip/camera.toml", *GENETIC, "--output", "out", "--viewer", "save")
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "config.json").write_text("{}")
+    (tmp_path / "out" / "config.json").write_text('{"odometry": {}}')
     done = gavo(*arguments)
     assert done.status == 0 and "the earlier run in out is replaced" in done.out, done
     assert (tmp_path / "out" / "run.rrd").stat().st_size and (tmp_path / "out" / "population.svg").exists()

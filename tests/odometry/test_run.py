@@ -57,6 +57,8 @@ class Own:
     [
         ({"check": None, "name": None}, "Own is not a Sequence: it has no name, check"),
         ({"timestamps": np.arange(2.0)}, r"Own: timestamps: .*3 frames"),
+        ({"timestamps": np.arange(3).astype("datetime64[s]")}, r"Own: timestamps: expected seconds, got datetime64"),
+        ({"timestamps": ["a", "b", "c"]}, "Own: timestamps: expected seconds"),
         ({"camera": "fr1"}, "expected a Camera"),
         ({"ground_truth": "groundtruth.txt"}, "Own: ground_truth: expected a Trajectory or None"),
         ({}, "frame 0: not there"),
