@@ -252,7 +252,7 @@ class Trajectory:
         left = np.where(times[right] == timestamps, right, np.maximum(right - 1, 0))
         gap = times[right] - times[left]
         valid = (times[left] <= timestamps) & (timestamps <= times[right]) & (gap <= ROUNDED * max_gap)
-        known = np.isfinite(samples).all(axis=(1, 2))
+        known = np.asarray(np.isfinite(samples).all(axis=(1, 2)))
         valid &= (segments[left] == segments[right]) & known[left] & known[right]
         fraction = np.divide(timestamps - times[left], gap, out=np.zeros_like(gap), where=gap > 0)[valid]
         start, end = samples[left[valid]], samples[right[valid]]
