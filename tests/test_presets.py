@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
@@ -85,6 +86,7 @@ def test_a_method_that_is_registered_goes_before_a_broken_package_of_its_name(mo
     """Then it is what the name stands for, and settings of it can be kept."""
     monkeypatch.setattr(presets, "entry_points", lambda group: [EntryPoint("quick", "no_such_package:S", group)])
 
+    @jax.tree_util.register_dataclass
     @dataclass(frozen=True)
     class Own(GaussNewton):
         """Its type tells whose it is."""
