@@ -137,10 +137,7 @@ def check_frame(
     """
     late = _check_timestamp(frame, timestamp, history)
     if late.use is Use.NOTHING:
-        finding, history = _doubt(late, history)
-        if history.timestamp is None and math.isfinite(timestamp):  # the clock was set back: it goes on from here
-            history = history._replace(timestamp=timestamp)
-        return finding, history
+        return _doubt(late, history, timestamp if math.isfinite(timestamp) else None)
     history = _with_timestamp(history, timestamp)
     if not isinstance(frame, Frame) or any(
         np.shape(image) != (camera.height, camera.width) for image in (frame.grey, frame.depth)
@@ -160,14 +157,14 @@ def check_frame(
         return _refused(AlignmentStatus.FROZEN), history
     history = history._replace(thumbnail=tuple(thumbnail.ravel().tolist()))
     if history.clipped and clipped - median(history.clipped) > MAX_CLIPPED_JUMP:
-        return _doubt(_refused(AlignmentStatus.BLANK), history)
+        return _doubt(_refused(AlignmentStatus.BLANK), history, timestamp)
     part_frozen = before.size == thumbnail.size and _is_part_frozen(grey, thumbnail, before.reshape(thumbnail.shape))
     frozen, history = _is_depth_frozen(frame, history)
     if frozen:
         return Finding(AlignmentStatus.FROZEN, Use.GREY), history
     depth, history = _check_depth(some_of(frame.depth), camera.depth_scale, history)
     if depth.use is Use.NOTHING:
-        return _doubt(depth, history)
+        return _doubt(depth, history, timestamp)
     history = history._replace(clipped=_remember(history.clipped, clipped), doubts=0)
     finding = late if depth.status is AlignmentStatus.OK else depth
     if part_frozen and finding.status is AlignmentStatus.OK:
@@ -210,11 +207,13 @@ def _refused(status: AlignmentStatus) -> Finding:
     return Finding(status, Use.NOTHING)
 
 
-def _doubt(finding: Finding, history: History) -> tuple[Finding, History]:
-    """Refuse a frame for being unlike those before; if that goes on, forget them, so that the next one can pass."""
+def _doubt(finding: Finding, history: History, timestamp: float | None) -> tuple[Finding, History]:
+    """Refuse a frame for being unlike those before; if that goes on, only its stamp and checksum are remembered.
+
+    Then the next frame can pass, and a clock that was set back goes on from here.
+    """
     if history.doubts + 1 < MAX_DOUBTS:
         return finding, history._replace(doubts=history.doubts + 1)
-    timestamp = None if finding.status is AlignmentStatus.BAD_TIMESTAMP else history.timestamp
     return finding, History(timestamp=timestamp, checksum=history.checksum)
 
 

@@ -165,6 +165,12 @@ def test_stamps_that_stay_the_same_are_never_usual(frames, first):
     assert uses == [Use.ALL, *lost * [Use.NOTHING], *(later - lost) * [Use.ALL]]
 
 
+def test_the_stamp_of_a_first_frame_out_of_order_is_not_the_last_one(frames):
+    """The frames after it would be too early."""
+    _, history = check_frame(TimestampError("out of order"), frames[0].timestamp + 9, CAMERA, History())
+    assert [finding.use for finding in look(history, *frames[1:4])[0]] == [Use.ALL] * 3
+
+
 @pytest.mark.parametrize("clip", ["fr1_xyz", "fr1_desk", "fr1_rpy"])
 def test_no_false_alarms_on_real_clips(data_dir, clip):
     sequence = TumSequence(data_dir / clip)

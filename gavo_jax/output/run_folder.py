@@ -112,9 +112,9 @@ class _GrowingFile:
 
 GROWING = (TRAJECTORY, ODOMETRY, FRAMES, BODIES, MOTIONS)
 """Files that grow with a run, if it has them."""
-AT_ITS_END = (METRICS, CHECKPOINT, LOOPS, RECORDING, VIEW)
-"""Files that a run writes now and then, or at its end; figures and masks come on top."""
-REPLACED = ("trajectory.*", CONFIG, *GROWING, *AT_ITS_END, MASKS, *FIGURE_NAMES)
+AT_ITS_END = (METRICS, LOOPS, RECORDING, VIEW)
+"""Files that a run writes at its end, besides its figures."""
+REPLACED = ("trajectory.*", CONFIG, CHECKPOINT, *GROWING, *AT_ITS_END, MASKS, *FIGURE_NAMES)
 """What a run replaces, which is the user's own if the folder holds no run's configuration."""
 
 
@@ -170,7 +170,7 @@ class RunFolder:
             GavoError: The folder holds files of another kind, or a file cannot be written.
         """
         self._refuse_foreign()
-        remove_files(self.path, CONFIG, *AT_ITS_END, *GROWING)
+        remove_files(self.path, CONFIG, CHECKPOINT, *AT_ITS_END, *GROWING)
         remove_figures(self.path)
         remove_masks(self.path)
         write_json(self.path / CONFIG, config)
@@ -214,7 +214,7 @@ class RunFolder:
         if self._seen.up_to(progress.last_index) != images:
             raise GavoError(f"{kept}: the images differ from those that the run has seen: run again without --resume")
         self._open(files)
-        remove_files(self.path, METRICS, LOOPS, RECORDING, VIEW, *({TRAJECTORY} - {self._poses}))
+        remove_files(self.path, *AT_ITS_END, *({TRAJECTORY} - {self._poses}))
         remove_figures(self.path)
         self._whole, self._segment = (files, images, progress), progress.segment
         self._last_pose = _last_stamp(self.path / self._poses)
