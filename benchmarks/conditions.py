@@ -145,6 +145,17 @@ def without_edges(index: int, raw: Image) -> Image:
     return np.where(cv2.dilate(steps.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0, 0, raw)
 
 
+def interpolated(index: int, raw: Image) -> Image:
+    """Shift depth by 0.4 pixels with linear interpolation, as if undistorted by someone who forgot about its edges."""
+    return cv2.warpAffine(raw.astype(np.float32), np.array([[1, 0, 0.4], [0, 1, 0.4]]), raw.shape[::-1])
+
+
+def upsampled(index: int, raw: Image) -> Image:
+    """Depth of a camera of 256 columns, interpolated to the size of the image."""
+    small = cv2.resize(raw.astype(np.float32), (256, 192), interpolation=cv2.INTER_NEAREST)
+    return cv2.resize(small, raw.shape[::-1], interpolation=cv2.INTER_LINEAR)
+
+
 def halved(camera: Camera) -> Camera:
     """The camera of images half as large along each side."""
     fx, fy, cx, cy = camera.scaled(0.5)
@@ -203,6 +214,8 @@ CONDITIONS: dict[str, Condition] = {
     "a third without depth": depth(lambda index, raw: np.where(random(index).random(raw.shape) < 0.3, 0, raw)),
     "depth in centimetres": depth(lambda index, raw: raw // 50 * 50),
     "depth without edges": depth(without_edges),
+    "depth interpolated": depth(interpolated),
+    "depth of 256 columns": depth(upsampled),
     "half size": with_camera(halved, smaller, lambda image: image[::2, ::2].copy()),
     "middle quarter": with_camera(cropped, middle, middle),
     "every second": frames(lambda index: index % 2 == 0),

@@ -81,6 +81,22 @@ def ignore() -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
+@contextlib.contextmanager
+def postponed() -> Iterator[None]:
+    """Let Ctrl-C in a `raised` block wait for the end of this one, which should be short."""
+    if signal.getsignal(signal.SIGINT) is not _raise or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    pressed: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, _raise)
+        if pressed:
+            _raise(signal.SIGINT, None)
+
+
 def interruptible(work: Callable[[], R]) -> R:
     """Call a function that spends long in compiled code, without making Ctrl-C wait for its end.
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gavo_jax.interrupts import interruptible, raised
+from gavo_jax.interrupts import interruptible, postponed, raised
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="sends signals")
 
@@ -52,6 +52,23 @@ def test_what_else_is_dropped_is_told_as_ever(capsys, monkeypatch):
     with raised():
         Faulty()
     assert told == [RuntimeError]
+
+
+def test_what_belongs_together_is_done_before_it_is_raised():
+    done: list[int] = []
+    with raised(), pytest.raises(KeyboardInterrupt):
+        with postponed():
+            send()
+            done.append(1)
+        done.append(2)
+    assert done == [1]
+    with raised():
+        with postponed():
+            done.append(3)
+        with pytest.raises(KeyboardInterrupt):
+            send()
+    with postponed():  # elsewhere nothing is changed
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_long_work_of_compiled_code_is_not_waited_for():

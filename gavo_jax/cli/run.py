@@ -37,7 +37,7 @@ from gavo_jax.odometry.metrics import run_identity
 from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.run import finish_run
 from gavo_jax.output.drawing import draw, draw_search
-from gavo_jax.output.files import ODOMETRY, RECORDING, TRAJECTORY, circumstances
+from gavo_jax.output.files import FIGURE_NAMES, ODOMETRY, RECORDING, TRAJECTORY, circumstances
 from gavo_jax.output.loops import write_loops
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import say, waiting
@@ -86,6 +86,7 @@ def run(options: Run) -> int:
         if metrics is not None:
             shown = "" if options.viewer == "none" else f"; gavo view {folder.path} shows it"
             print_message(f"{folder.path}: the run is already complete: nothing to resume{shown}")
+            _draw_if_missing(options, sequence, folder)
         else:
             # before an earlier run is replaced, as opening may fail
             viewer.open(name, sequence.camera, sequence.timestamps, sequence.ground_truth)
@@ -222,19 +223,38 @@ def _track(
         viewer.show_corrected(outcome.trajectory, outcome.loops)
     metrics = {
         **run_identity(sequence.name, options.method, unchanged_preset(odometry.settings, options), options.seed),
-        "complete": len(outcome.steps) == len(sequence) - 1,
+        "complete": len(outcome.steps) == len(sequence) - 1 and not tracked.interrupted,
         "left_out": left_out(sequence),
         **outcome.figures,
     }
     folder.finish(metrics, complete=not tracked.interrupted)
 
     def draw_figures() -> None:
-        curves = {options.method: outcome.trajectory}
-        if outcome.odometry is not None:
-            curves = {f"{options.method} with loops": outcome.trajectory, "odometry": outcome.odometry}
-        draw(folder.path, curves, sequence.ground_truth, list(curves)[:1])
+        _draw(options.method, folder, outcome.trajectory, outcome.odometry, sequence.ground_truth)
         draw_search(folder.path, sequence, odometry, revised(tracked.steps))
 
     with waiting("drawing figures …"):
         interruptible(draw_figures)
     return metrics, tracked.interrupted
+
+
+def _draw(
+    method: str, folder: RunFolder, trajectory: Trajectory, odometry: Trajectory | None, truth: Trajectory | None
+) -> None:
+    """Draw a run's trajectory, beside the odometry's if loops corrected it."""
+    curves = {method: trajectory}
+    if odometry is not None:
+        curves = {f"{method} with loops": trajectory, "odometry": odometry}
+    draw(folder.path, curves, truth, list(curves)[:1])
+
+
+def _draw_if_missing(options: Run, sequence: Sequence, folder: RunFolder) -> None:
+    """Draw the trajectory of a complete run that was interrupted before it had figures."""
+    if any((folder.path / name).exists() for name in FIGURE_NAMES):
+        return
+    trajectory, odometry = (
+        Trajectory.read_tum(path) if (path := folder.path / name).exists() else None for name in (TRAJECTORY, ODOMETRY)
+    )
+    if trajectory is not None:
+        with waiting("drawing figures …"):
+            interruptible(lambda: _draw(options.method, folder, trajectory, odometry, sequence.ground_truth))

@@ -19,6 +19,11 @@ LEVELS = 5
 # edge keeps the nearer one.
 EDGE_TOLERANCE = 0.03
 
+STEEPEST = 20.0
+"""Change of inverse depth from a pixel to the next, as a share of it and times the pixels of the image's longer side,
+above which the two are of two surfaces: that of a surface seen at about 4 degrees. The share is at least
+`EDGE_TOLERANCE`."""
+
 
 class PyramidLevel(NamedTuple):
     """One level of one frame."""
@@ -65,6 +70,27 @@ def halve_inverse_depth(inverse_depth: Float[Array, "h w"]) -> Float[Array, "h2 
     return total / jnp.maximum(count, 1.0)
 
 
+def without_mixed_readings(inverse_depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
+    """Drop readings between two surfaces, or between one and no reading: no neighbour along u or along v is like them.
+
+    A time-of-flight camera mixes what its pixel sees at a boundary ("flying pixels"). So does whoever resizes or
+    undistorts depth by interpolation. They would be points where nothing is, and at the image's edges, which the search
+    prefers.
+    """
+    tolerance = max(EDGE_TOLERANCE, STEEPEST / max(inverse_depth.shape))
+    around = jnp.pad(inverse_depth, 1)
+
+    def is_between(before: jax.Array, after: jax.Array) -> jax.Array:
+        unlike = [
+            jnp.abs(beside - inverse_depth) > tolerance * jnp.maximum(beside, inverse_depth)
+            for beside in (before, after)
+        ]
+        return unlike[0] & unlike[1] & (jnp.maximum(before, after) > 0)
+
+    mixed = is_between(around[1:-1, :-2], around[1:-1, 2:]) | is_between(around[:-2, 1:-1], around[2:, 1:-1])
+    return jnp.where(mixed, 0.0, inverse_depth)
+
+
 def build_pyramid(
     grey: Integer[Array, "h w"] | Float[Array, "h w"],
     depth: Integer[Array, "h w"] | Float[Array, "h w"],
@@ -85,7 +111,7 @@ def build_pyramid(
     z = depth.astype(jnp.float32)
     inverse = jnp.where((z > 0) & jnp.isfinite(z), depth_scale / jnp.where(z > 0, z, 1.0), 0.0)
     grey = jnp.nan_to_num(grey.astype(jnp.float32))
-    pyramid = [PyramidLevel(grey, inverse)]
+    pyramid = [PyramidLevel(grey, without_mixed_readings(inverse))]
     for _ in range(levels - 1):
         pyramid.append(PyramidLevel(halve_grey(pyramid[-1].grey), halve_inverse_depth(pyramid[-1].inverse_depth)))
     return tuple(pyramid)

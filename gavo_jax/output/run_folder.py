@@ -55,6 +55,8 @@ IDENTITY_VERSIONS = ("gavo-jax", "jax", "numpy", "opencv")
 """Packages whose versions in config.json must be unchanged for a run to be resumed."""
 
 
+IMAGES = "images_sha256"
+"""Key of metrics.json: digest of the images that the run has seen."""
 CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
 
 
@@ -72,10 +74,10 @@ class _GrowingFile:
             self._file = os.open(path, os.O_RDWR | kind | CAREFUL, 0o666)
             self.cut(0 if mark is None else mark.size)
         except OSError as error:
-            raise self._fault(error) from None
+            raise (GavoError(_changed(path)) if isinstance(error, FileNotFoundError) else self._fault(error)) from None
         if mark is not None and self.mark() != mark:
             self.close()
-            raise GavoError(f"{path}: changed since the checkpoint: run again without --resume")
+            raise GavoError(_changed(path))
 
     def append(self, line: str) -> None:
         data = (line + "\n").encode("utf-8")
@@ -108,6 +110,14 @@ class _GrowingFile:
 
     def _fault(self, error: OSError) -> GavoError:
         return GavoError(f"{self.path}: cannot be written to: {error.strerror or error}")
+
+
+def _changed(path: Path) -> str:
+    return f"{path}: changed since the checkpoint: run again without --resume"
+
+
+def _other_images(path: Path) -> str:
+    return f"{path}: the images differ from those that the run has seen: run again without --resume"
 
 
 GROWING = (TRAJECTORY, ODOMETRY, FRAMES, BODIES, MOTIONS)
@@ -212,10 +222,12 @@ class RunFolder:
         if set(files) != set(self._growing(config)):
             raise GavoError(f"{kept}: damaged or incomplete checkpoint: run again without --resume")
         if self._seen.up_to(progress.last_index) != images:
-            raise GavoError(f"{kept}: the images differ from those that the run has seen: run again without --resume")
+            raise GavoError(_other_images(kept))
         self._open(files)
         remove_files(self.path, *AT_ITS_END, *({TRAJECTORY} - {self._poses}))
-        remove_figures(self.path)
+        frames = config.get("sequence", {}).get("frames")
+        if frames is None or progress.last_index < frames - 1:  # else they show the last pairs, and nothing is left
+            remove_figures(self.path)
         self._whole, self._segment = (files, images, progress), progress.segment
         self._last_pose = _last_stamp(self.path / self._poses)
         remove_masks(self.path, after=self._last_pose)
@@ -232,13 +244,16 @@ class RunFolder:
         """Return the metrics of a complete earlier run in this folder, whose rows are revised; None if there is none.
 
         Raises:
-            GavoError: They cannot be read.
+            GavoError: They cannot be read, or the images have changed.
         """
         path = self.path / METRICS
         if not path.exists() or (self.path / CHECKPOINT).exists():
             return None
+        metrics = read_json_object(path)
+        if metrics.get(IMAGES, unchanged := self._seen.all()) != unchanged:
+            raise GavoError(_other_images(path))
         self._revise()  # it may have been killed before that
-        return read_json_object(path)
+        return metrics
 
     def add(self, step: Step, progress: Progress | None = None) -> None:
         """Append one frame: its rows and masks, and its pose unless its timestamp is in doubt.
@@ -299,7 +314,7 @@ class RunFolder:
         Raises:
             GavoError: It cannot be written.
         """
-        write_json(self.path / METRICS, metrics)
+        write_json(self.path / METRICS, {**metrics, IMAGES: self._whole[1]})
         if complete:
             remove_files(self.path, CHECKPOINT)
             self._revise()

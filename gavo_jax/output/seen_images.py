@@ -4,19 +4,25 @@ import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
-TAIL = 64
-"""Bytes read at a file's end. In a PNG they hold the checksum of all pixels, so that nothing else is needed."""
+BLOCKS, BLOCK = 16, 4096
+"""Number of blocks that are read of a file, spread evenly from its first to its last bytes, and their size in bytes.
+The last bytes of a PNG hold the checksum of all pixels; other formats have none.
+"""
 
 
 class SeenImages:
     """A digest of image files, updated frame by frame.
 
     Args:
-        files: Files of each frame, in order; empty if frames do not come from files.
+        files: Files of each frame, in order; none of a frame whose images are in a file of an earlier one.
     """
 
     def __init__(self, files: Sequence[Sequence[Path]] = ()) -> None:
         self._files, self._count, self._sha256 = files, 0, hashlib.sha256()
+
+    def all(self) -> str:
+        """Return the digest of the images of all frames."""
+        return self.up_to(len(self._files) - 1)
 
     def up_to(self, index: int) -> str:
         """Add the frames up to an index, and return the digest of all so far."""
@@ -28,11 +34,16 @@ class SeenImages:
 
 
 def _fingerprint(path: Path) -> bytes:
-    """Return a hash of a file's size and last bytes, or zeros if it is unreadable."""
+    """Return a hash of a file's size and some of its bytes, or zeros if it is unreadable."""
     try:
         with path.open("rb") as file:
             size = file.seek(0, 2)
-            file.seek(max(size - TAIL, 0))
-            return hashlib.sha256(size.to_bytes(8) + file.read(TAIL)).digest()
+            seen = hashlib.sha256(size.to_bytes(8))
+            for block in range(BLOCKS):
+                file.seek(max(size - BLOCK, 0) * block // (BLOCKS - 1))
+                seen.update(file.read(BLOCK))
+                if size <= BLOCK:
+                    break
+            return seen.digest()
     except OSError:
         return bytes(32)

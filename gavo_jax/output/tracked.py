@@ -6,7 +6,7 @@ from typing import NamedTuple
 from gavo_jax.compilation.waits import Stopwatch, told_of_waits
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.errors import print_message
-from gavo_jax.interrupts import interruptible
+from gavo_jax.interrupts import interruptible, postponed
 from gavo_jax.mapping.background import BackgroundMapper
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.run import RunOutcome, finish_run
@@ -61,9 +61,10 @@ def track_visibly(
         try:
             with told_of_waits(bar.compiling):
                 for step in track(sequence, odometry=odometry, watch=watch):
-                    if on_step is not None:
-                        on_step(step)
-                    steps.append(step)
+                    with postponed():  # or the count of steps and what is written of them would differ
+                        if on_step is not None:
+                            on_step(step)
+                        steps.append(step)
                     bar.advance()
         except KeyboardInterrupt:
             if not steps:

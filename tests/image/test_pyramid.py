@@ -117,6 +117,47 @@ def test_halved_depth_lies_on_the_nearest_surface(inverse_depth: np.ndarray) -> 
     assert np.all(half >= nearest * 0.95), "a farther surface was mixed in"
 
 
+def readings(*rows: list[float], width: int = 640) -> np.ndarray:
+    """Which of some depths, metres, are kept: each row is a strip of an image of that width, repeated below."""
+    kept = []
+    for row in rows:
+        depth = np.ones((8, width), np.float32)
+        depth[:, : len(row)] = row
+        image = build(np.zeros(depth.shape, np.uint8), depth, 1.0, levels=1)[0]
+        turned = build(np.zeros(depth.T.shape, np.uint8), depth.T, 1.0, levels=1)[0]
+        found = np.asarray(image.inverse_depth) > 0
+        np.testing.assert_array_equal(np.asarray(turned.inverse_depth).T > 0, found)
+        kept.append(found[4, : len(row)])
+    return np.array(kept)
+
+
+def test_readings_between_two_surfaces_are_none() -> None:
+    """As a time-of-flight camera has them at boundaries, and whoever interpolates depth."""
+    one_pixel, three_pixels, into_a_hole, alone = readings(
+        [1, 1, 1, 1.4, 2, 2, 2, 1, 1],
+        [1, 1, 1.2, 1.5, 1.8, 2, 2, 2, 2],
+        [1, 1, 0.7, 0.2, 0, 0, 0.4, 1, 1],
+        [1, 1, 1, 1, 7, 1, 1, 1, 1],
+    )
+    np.testing.assert_array_equal(np.flatnonzero(~one_pixel), [3])
+    np.testing.assert_array_equal(np.flatnonzero(~three_pixels), [2, 3, 4])
+    np.testing.assert_array_equal(np.flatnonzero(~into_a_hole), [2, 3, 4, 5, 6])
+    np.testing.assert_array_equal(np.flatnonzero(~alone), [4])
+
+
+def test_readings_beside_an_edge_or_a_hole_are_kept() -> None:
+    step, hole = [1, 1, 1, 1, 2, 2, 2, 2, 2], [1, 1, 0, 0, 0, 2, 2, 2, 2]
+    slanted, sparse = [1, 1.02, 1.04, 1.06, 1.08, 1.1, 1.12, 1.14, 1.16], [0, 3, 0, 0, 2, 0, 1, 1, 1]
+    rows = [step, hole, slanted, sparse]
+    np.testing.assert_array_equal(readings(*rows), np.array(rows) > 0)
+
+
+def test_small_images_may_change_more_from_a_pixel_to_the_next() -> None:
+    """The floor, seen in 80 columns."""
+    row = [1 / (1 - 0.1 * pixel) for pixel in range(8)]
+    assert readings(row, width=80).all() and not readings(row).all()
+
+
 def test_zeros_stay_zeros_on_every_level() -> None:
     rng = np.random.default_rng(0)
     depth = rng.uniform(1, 1.01, (64, 64)).astype(np.float32)

@@ -348,6 +348,53 @@ def test_a_finished_run_that_nothing_tells_of_is_not_shown_for_another(whole, cl
     assert "config.json: no such file" in capsys.readouterr().err
 
 
+def test_images_that_changed_after_a_complete_run_are_noticed(clip, tmp_path, capsys, undrawn):
+    """They would make a map with the poses of others."""
+    own = tmp_path / "clip"
+    shutil.copytree(clip, own)
+    assert main(arguments(own, tmp_path / "out")) == 0
+    assert main(arguments(own, tmp_path / "out", "--resume")) == 0
+    image = sorted((own / "depth").iterdir())[-1]
+    picture = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    cv2.imwrite(str(image), picture[::-1])
+    capsys.readouterr()
+    assert main(arguments(own, tmp_path / "out", "--resume")) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "the images differ from those" in error
+
+
+def test_ctrl_c_in_the_last_row_leaves_the_row_and_the_figures(clip, whole, tmp_path, monkeypatch, capsys):
+    append = RunFolder.add
+
+    def add(self: RunFolder, step: Any, progress: Progress | None = None) -> None:
+        append(self, step, progress)
+        if step.index == 39:
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunFolder, "add", add)
+        assert main(arguments(clip, tmp_path / "out")) == 130
+    told = capsys.readouterr().err
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert "interrupted after 39 of 39 pairs" in told and metrics["pairs"] == 39 and metrics["complete"] is False
+    assert main(arguments(clip, tmp_path / "out", "--resume")) == 0
+    assert same_ending(tmp_path / "out", whole)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {path.name for path in whole.iterdir()}
+
+
+def test_figures_that_were_interrupted_are_drawn_later(clip, tmp_path, monkeypatch):
+    def stop(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "draw", stop)
+        assert main(arguments(clip, tmp_path / "out")) == 130
+    assert not list((tmp_path / "out").glob("*.png"))
+    assert main(arguments(clip, tmp_path / "out", "--resume")) == 0
+    assert (tmp_path / "out" / "trajectory.png").exists() and (tmp_path / "out" / "distance_error.png").exists()
+
+
 def test_metrics_are_there_before_the_figures(clip, tmp_path, monkeypatch, capsys):
     def full(*arguments: Any) -> None:
         raise GavoError("trajectory.png: cannot be written: No space left on device")

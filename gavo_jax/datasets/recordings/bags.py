@@ -94,6 +94,11 @@ class BagSequence:
         return self._timestamps
 
     @property
+    def files(self) -> list[tuple[Path, ...]]:
+        """Files of each frame's images: those of the recording, with the first frame, as they hold all."""
+        return [self._bag.files, *((),) * (len(self) - 1)][: len(self)]
+
+    @property
     def topics(self) -> tuple[str, str]:
         """Names of the colour and depth topics."""
         color, depth = self._topics

@@ -196,6 +196,12 @@ def is_calibrated(info: Any) -> bool:
     return info.width > 0 and any(getattr(info, "k", getattr(info, "K", ())))
 
 
+def intrinsics(info: Any) -> list[float]:
+    """Return fx, cx, fy, cy, width and height of a camera_info."""
+    matrix = getattr(info, "k", getattr(info, "K", ()))
+    return [float(number) for number in (*(matrix[place] for place in (0, 2, 4, 5)), info.width, info.height)]
+
+
 def camera_table(info: Any, rectified: bool) -> dict[str, Any]:
     """Convert a camera_info to the keys of a camera file.
 

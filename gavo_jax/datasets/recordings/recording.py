@@ -25,6 +25,7 @@ from gavo_jax.datasets.recordings.messages import (
     camera_table,
     color_of,
     depth_of,
+    intrinsics,
     is_calibrated,
     is_depth,
 )
@@ -46,6 +47,8 @@ FOREIGN = {
     "ros1": "its profile is 'ros1', and the library reads only 'ros2': pass the .bag that it was made from",
 }
 """What to do about an unsupported MCAP, by the profile in its header."""
+HEADER = 12
+"""Bytes at the start of a message up to and including its stamp."""
 FEW = 30
 """Number of messages of a topic that are searched for a usable one."""
 ROUNDED = 0.05
@@ -72,6 +75,11 @@ class Bag:
             _own_files(self._reader)
         weakref.finalize(self, _close, self._reader)
         self.kinds = {c.topic: c.msgtype for c in self._reader.connections if c.msgtype in (IMAGE, COMPRESSED)}
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files of the recording."""
+        return (self.path,) if self.path.is_file() else tuple(sorted(filter(Path.is_file, self.path.iterdir())))
 
     def stream(self, names: list[str], start: int | None = None) -> Iterator[tuple[str, bytes, str]]:
         """Topic, content and type of messages in the order of their arrival, from time `start` (ns) on."""
@@ -121,6 +129,8 @@ class Bag:
         for name, kind in sorted(self.kinds.items()):
             if (message := self.first(name)) is not None:
                 images[name] = ImageTopic.of(kind, message, name)
+        if self.kinds and not images:
+            raise GavoError(f"{self.path}: contains no images: no messages on {', '.join(sorted(self.kinds))}")
         color, depth = choose(self.path, images, reading.color_topic, reading.depth_topic)
         are_named = reading.color_topic is not None and reading.depth_topic is not None
         if are_of_two_cameras(color, depth) and not are_named:
@@ -159,7 +169,7 @@ class Bag:
                 f"{ANY_TOPIC} contains a fixed transform between them: "
                 "pass --camera with a file for both cameras ([depth], colour_T_depth), or another --depth-topic"
             )
-        origin = f"{name}, {other[0]} and {where}"
+        origin = f"{name} and {other[0]}" if frames[0] == frames[1] else f"{name}, {other[0]} and {where}"
         return Calibration(camera, moved, color_T_depth, origin, states_depth_scale=False)
 
     def _alone(self, camera: Camera, name: str, topics: tuple[str, str], frame: str) -> Calibration:
@@ -207,8 +217,24 @@ class Bag:
         beside = ["/".join(parts[:length]) for length in range(len(parts) - 1, 0, -1)]
         for name in (f"{place}/{inner}camera_info" for place in beside for inner in ("", "info/")):
             if name in infos and (message := self.first(name, is_calibrated) or self.first(name)) is not None:
+                self._refuse_another_camera(name, message)
                 return name, message
         return None
+
+    def _refuse_another_camera(self, name: str, info: Any) -> None:
+        """Refuse a camera that changes within the recording, as one that zooms or switches its mode does."""
+        with legible(self.path):
+            # but for the stamp, all messages are usually the same
+            distinct = {raw[HEADER:]: (raw, kind) for _, raw, kind in self.stream([name])}
+            others = [self._reader.deserialize(*content) for content in distinct.values()]
+        numbers = [intrinsics(one) for one in (info, *others) if is_calibrated(one)]
+        for other in numbers[1:]:
+            if not np.allclose(other, numbers[0], rtol=0, atol=ROUNDED):
+                fx = f"fx is {numbers[0][0]:g} at first, {other[0]:g} later"
+                raise GavoError(
+                    f"{self.path}: {name}: the camera changes within the recording ({fx}): pass --camera with one that "
+                    "applies throughout"
+                )
 
     def _camera(self, name: str, info: Any, topic: str) -> Camera:
         place = f"{self.path}: {name}"

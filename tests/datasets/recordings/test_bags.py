@@ -33,6 +33,9 @@ STAMPS = [1305031102.175304 + i / 30 for i in range(4)]
 LENS = replace(CAMERA, distortion=(0.05, -0.1, 0.001, 0.0, 0.02))
 BGRS = [cv2.applyColorMap(grey, cv2.COLORMAP_BONE) for grey in GREYS]
 
+SUFFIX = {"ros1": ".bag", "sqlite": "", "mcap": ""}
+"""Ending of a recording's name, by its kind."""
+
 
 def shots(depths: list[np.ndarray] = MILLIMETRES, delay: float = 0.004) -> list[Shot]:
     return [Shot(*parts, parts[0] + delay) for parts in zip(STAMPS, BGRS, depths, strict=True)]
@@ -442,6 +445,42 @@ def test_of_a_topic_and_its_compressed_copy_the_former_is_read(tmp_path):
     recorder.close()
     sequence = open_source(tmp_path / "all", Reading(camera=CAMERA))
     assert isinstance(sequence, BagSequence) and [topic.name for topic in sequence._topics] == [COLOR, DEPTH]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_camera_that_changes_within_the_recording_is_refused(tmp_path, kind):
+    """As one that zooms, or whose mode was switched; rounding is no change."""
+    for name, others in (("rounded", CAMERA.fx + 0.01), ("zoomed", 0.8 * CAMERA.fx)):
+        recorder = Recorder(tmp_path / f"{name}{SUFFIX[kind]}", kind)
+        for index, shot in enumerate(shots()):
+            STYLES["raw"](recorder, shot, shot.stamp)
+            camera = replace(CAMERA, fx=CAMERA.fx if index < 2 else others)
+            recorder.info("/camera/color/camera_info", shot.stamp, camera)
+        recorder.close()
+    rounded, zoomed = (tmp_path / f"{name}{SUFFIX[kind]}" for name in ("rounded", "zoomed"))
+    assert open_source(rounded).camera.fx == CAMERA.fx
+    with pytest.raises(GavoError, match=r"color/camera_info: the camera changes within the recording \(fx is .*pass"):
+        open_source(zoomed)
+    assert open_source(zoomed, Reading(camera=CAMERA)).camera.fx == CAMERA.fx
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_topics_without_messages_are_told_from_none(tmp_path, kind):
+    recorder = Recorder(tmp_path / f"empty{SUFFIX[kind]}", kind)
+    for topic in (COLOR, DEPTH):
+        name = "sensor_msgs/msg/Image"
+        recorder.connections[topic] = recorder.writer.add_connection(topic, name, typestore=recorder.store)
+    recorder.info("/camera/color/camera_info", 1.0, CAMERA)
+    recorder.close()
+    with pytest.raises(GavoError, match=f"contains no images: no messages on {DEPTH}, {COLOR}$"):
+        open_source(tmp_path / f"empty{SUFFIX[kind]}")
+
+
+def test_the_files_of_a_recording_come_with_its_first_frame(bags):
+    sequence = open_source(bags["mcap", "raw", "u16"])
+    assert isinstance(sequence, BagSequence)
+    first, *others = sequence.files
+    assert others == [()] * 3 and {path.suffix for path in first} == {".mcap", ".yaml"} and len(sequence[:0].files) == 0
 
 
 def test_a_camera_info_of_zeros_is_none(tmp_path):
