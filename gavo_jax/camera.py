@@ -111,13 +111,18 @@ class Camera:
         """Return the camera of an image whose pixels average n × n each; leftover columns and rows are cut off.
 
         Centres map as c' = (c + 1/2) / n - 1/2. Distortion is unchanged: it acts on normalised coordinates.
+
+        Raises:
+            GavoError: `pixels` is no whole number of at least 1.
         """
+        _require_counts(pixels=pixels)
         fx, fy, cx, cy = self.scaled(1 / pixels)
         size = {"width": self.width // pixels, "height": self.height // pixels}
         return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, **size)
 
     def resized(self, width: int, height: int) -> "Camera":
-        """Return the camera of the same view at another size."""
+        """Return the camera of the same view at another size, two whole numbers of at least 1; raises as `binned`."""
+        _require_counts(width=width, height=height)
         (fx, _, cx, _), (_, fy, _, cy) = self.scaled(width / self.width), self.scaled(height / self.height)
         return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
@@ -275,8 +280,8 @@ def require_camera(camera: Camera) -> None:
     for name, least in {"fx": 0.0, "fy": 0.0, "cx": -np.inf, "cy": -np.inf, "depth_scale": 0.0}.items():
         if not (_is_number(value := getattr(camera, name)) and value > least):
             raise GavoError(f"camera: {name}: expected a {'positive ' * (least == 0)}number, got {value!r}")
-    if not (_is_number(camera.readout) and camera.readout >= 0):
-        raise GavoError(f"camera: readout: expected seconds of at least 0, got {camera.readout!r}")
+    if not (_is_number(camera.readout) and 0 <= camera.readout <= 1):
+        raise GavoError(f"camera: readout: expected seconds from 0 to 1, got {camera.readout!r}")
     if camera.model not in DISTORTION_COUNTS:
         raise GavoError(f"camera: model: expected one of {', '.join(DISTORTION_COUNTS)}, got {camera.model!r}")
     counts, distortion = DISTORTION_COUNTS[camera.model], camera.distortion
@@ -291,6 +296,12 @@ def require_camera(camera: Camera) -> None:
     if min(camera.width, camera.height) < MIN_SIDE:
         size = f"{camera.width}x{camera.height}"
         raise GavoError(f"images of {size} are too small: the search needs at least {MIN_SIDE} pixels per side")
+
+
+def _require_counts(**counts: Any) -> None:
+    for name, value in counts.items():
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+            raise GavoError(f"{name}: expected a whole number of at least 1, got {value!r}")
 
 
 def _in_own_order(image: np.ndarray) -> np.ndarray:

@@ -84,7 +84,7 @@ def save_settings(path: str | Path, settings: Settings, method: str | None = Non
         preset: Preset that the file is based on.
 
     Raises:
-        GavoError: The file cannot be written, or the settings hold code of another package.
+        GavoError: The file cannot be written, or the settings are invalid or hold code of another package.
     """
     if not isinstance(settings, Settings):
         raise GavoError(f"{path}: expected Settings, got {type(settings).__name__}")
@@ -94,6 +94,7 @@ def save_settings(path: str | Path, settings: Settings, method: str | None = Non
     method = method or known[type(settings.solver)]
     if type(presets.preset(method, preset).solver) is not type(settings.solver):
         raise GavoError(f"{path}: method {method} is not that of a {type(settings.solver).__name__}")
+    require_settings(settings, str(path))
     table: dict[str, Any] = {"method": method, "preset": preset}
     for part_name in PARTS:
         part = getattr(settings, part_name)

@@ -329,7 +329,8 @@ def test_no_camera_file_raises_anything_else(tmp_path_factory, content, suffix):
         ({"vignetting": (-10.0,)}, "vignetting: multiplies parts of the image by -"),
         ({"vignetting": (1e300,)}, "vignetting: multiplies parts"),
         ({"depth_scale": 0.0}, "depth_scale: expected a positive number"),
-        ({"readout": -0.02}, "readout: expected seconds of at least 0"),
+        ({"readout": -0.02}, "readout: expected seconds"),
+        ({"readout": 20.0}, "readout: expected seconds from 0 to 1, got 20.0"),
         ({"distortion": [0.1, 0.0, 0.0, 0.0]}, "distortion: expected a tuple of 4, 5, 8, 12, 14 numbers"),
         ({"distortion": (0.1, 0.2, 0.3)}, "distortion: expected a tuple"),
         ({"distortion": (0.1,) * 5, "model": "fisheye"}, "distortion: expected a tuple of 4 numbers"),
@@ -375,3 +376,12 @@ def test_a_camera_holds_whatever_stands_for_its_numbers() -> None:
     for leaf in (None, "fx", object(), True):
         assert jax.tree.map(lambda _, leaf=leaf: leaf, camera).fx is leaf
     assert jax.grad(lambda one: one.fx * one.cx)(jax.tree.map(float, camera)).fx == 79.5
+
+
+@pytest.mark.parametrize("wrong", [0, -2, 1.5, True, "2", None])
+def test_images_have_whole_numbers_of_pixels(wrong: Any) -> None:
+    camera = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
+    for call in (lambda: camera.binned(wrong), lambda: camera.resized(wrong, 60), lambda: camera.resized(80, wrong)):
+        with pytest.raises(GavoError, match="expected a whole number of at least 1"):
+            call()
+    assert camera.binned(np.int64(2)) == camera.resized(80, 60)  # pyright: ignore[reportArgumentType]

@@ -241,6 +241,12 @@ def test_numbers_of_arrays_are_written_as_numbers(tmp_path):
     assert again == GeneticAlgorithm(mutants=0.25, patience=5, spread=(0.5,) * 5)
 
 
+def test_settings_out_of_range_are_not_written(tmp_path):
+    with pytest.raises(GavoError, match=r"s\.toml: solver\.mutants: must be at most 1"):
+        save_settings(tmp_path / "s.toml", Settings(GeneticAlgorithm(mutants=2.0)))
+    assert not (tmp_path / "s.toml").exists()
+
+
 @pytest.mark.parametrize(("method", "preset"), [("pso", "default"), (None, "nosuch")])
 def test_what_could_not_be_read_again_is_not_written(tmp_path, method, preset):
     with pytest.raises(GavoError, match=r"pso is not that of a GeneticAlgorithm|nosuch"):

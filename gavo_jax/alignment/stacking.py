@@ -72,6 +72,13 @@ def _plain(image: Any) -> Any:
     return image if isinstance(image, jax.Array) else as_array(image)
 
 
+def _without_bars(pairs: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+    """Remove bars from pairs of NumPy or JAX images; where there are none, return the same list."""
+    seen = [(np.asarray(grey), np.asarray(depth)) for grey, depth in pairs]
+    without = [without_bars(*pair) for pair in seen]
+    return pairs if all(new[0] is old[0] for new, old in zip(without, seen, strict=True)) else without
+
+
 def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
     if not isinstance(frame, Frame) and (not isinstance(frame, tuple | list) or len(frame) != 2):
         raise GavoError(f"expected a Frame or a pair (grey, depth), got {type(frame).__name__}")
@@ -80,8 +87,7 @@ def _rectified_images(frame: Frame | tuple[Any, Any], camera: Camera) -> Images:
         require_image(name, image, (camera.height, camera.width))
     require_grey_levels(grey)
     depth = with_zeros(depth)
-    if isinstance(grey, np.ndarray) and isinstance(depth, np.ndarray):
-        grey, depth = without_bars(grey, depth)
+    [(grey, depth)] = _without_bars([(grey, depth)])
     if not camera.is_rectified:
         grey, depth = camera.undistort(np.asarray(grey), np.asarray(depth))
     return Images(grey, depth)
@@ -117,8 +123,9 @@ def stacked_images(side: Any, camera: Camera) -> Images:
         for name, images in zip(("grey", "depth"), side, strict=True):
             require_image(name, images, (len(side[0]), camera.height, camera.width))
         require_grey_levels(side[0])
-        if all(isinstance(images, np.ndarray) for images in side):
-            side = tuple(map(np.stack, zip(*map(without_bars, *side), strict=True)))
+        pairs = list(zip(*map(np.asarray, side), strict=True))
+        if (without := _without_bars(pairs)) is not pairs:
+            side = tuple(map(np.stack, zip(*without, strict=True)))
         return Images(jnp.asarray(side[0]), jnp.asarray(with_zeros(side[1])))
     images = [_rectified_images(frame, camera) for frame in side]
     return Images(*(jnp.stack([jnp.asarray(image) for image in images]) for images in zip(*images, strict=True)))

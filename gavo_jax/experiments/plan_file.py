@@ -13,7 +13,7 @@ from typing import Any
 from gavo_jax import presets
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.selection import SYNTHETIC
-from gavo_jax.errors import GavoError, read_toml
+from gavo_jax.errors import GavoError, read_toml, shown
 from gavo_jax.experiments.plan import Part, Plan, RayOptions, Run, configuration, frames_of
 from gavo_jax.experiments.values import (
     MAX_RUNS,
@@ -55,6 +55,8 @@ def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
     table = read_toml(path)
     refuse_unknown(str(path), table, KEYS)
     name = text_of(f"{path}: name", table.get("name", path.stem))
+    if {"/", "\\"} & set(name):
+        raise GavoError(f"{path}: name: {shown(name)} names the folder of the results, so it cannot have / or \\")
     parts, skipped = parts_of(path, table)
     default_seeds = seeds_of(f"{path}: seeds", table.get("seeds", [0]))
     methods = tables_of(f"{path}: methods", table.get("methods", []))

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from small import CAMERA, NEWTON
@@ -82,9 +83,12 @@ def test_rows_of_many_levels_or_few_rows_are_no_bar(grey: np.ndarray) -> None:
 def test_stacks_of_images_come_without_bars(grey: np.ndarray) -> None:
     camera = Camera(60.0, 60.0, 39.5, 29.5, 80, 60)
     image = barred(grey)
-    one, many = (stacked_images(side, camera) for side in ([(image, DEPTH)], (image[None], DEPTH[None])))
-    for found, wanted in zip(many, one, strict=True):
-        np.testing.assert_array_equal(found, wanted)
+    clean = without_bars(image, DEPTH)
+    for kind in (np.asarray, jnp.asarray):
+        pair = kind(image), kind(DEPTH)
+        for side in ([pair], tuple(part[None] for part in pair)):
+            for found, wanted in zip(stacked_images(side, camera), clean, strict=True):
+                np.testing.assert_array_equal(found[0], wanted)
 
 
 def test_frames_and_pairs_come_without_bars() -> None:

@@ -148,6 +148,7 @@ REFUSED = {
         METHOD + "solver.pressure = 8\nsweep.solver.pressure = [4]",
         ["pressure", "a fixed value, too"],
     ),
+    "name of another folder": ('name = "../../x"', METHOD, ["name", "'../../x'", "cannot have /"]),
     "no path": ("[[sequences]]\npath = []\n", METHOD, ["path: an empty list"]),
     "sweep without a list": ("", METHOD + "sweep.solver.pressure = 8", ["sweep.solver.pressure", "list"]),
     "settings of a peer": ("", '[[methods]]\nname = "opencv-rgb"\nseeds = 3', ["opencv-rgb", "'seeds'"]),
