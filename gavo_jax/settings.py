@@ -160,7 +160,8 @@ def as_settings(value: "Settings | Solver | None" = None, solver: Solver | None 
     elif isinstance(value, Solver) and not isinstance(value, type):
         settings = Settings(value)
     else:
-        raise TypeError(f"neither Settings nor a solver: {type(value).__name__}")
+        hint = f": gavo.preset({value!r}) gives a method's settings" if isinstance(value, str) else ""
+        raise TypeError(f"neither Settings nor a solver: {type(value).__name__}{hint}")
     given = {name: part for name, part in parts.items() if part is not None}
     if given:
         words = "options and alignment are now parts of the settings: dataclasses.replace(settings, alignment=…)"

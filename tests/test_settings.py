@@ -25,6 +25,11 @@ def test_a_solver_stands_for_the_default_settings_with_it():
     assert as_settings(gavo.preset("pso", "fast"), NEWTON) == replace(gavo.preset("pso", "fast"), solver=NEWTON)
 
 
+def test_the_name_of_a_method_is_told_what_gives_its_settings():
+    with pytest.raises(TypeError, match=r"neither Settings nor a solver: str: gavo.preset\('ga'\) gives"):
+        as_settings("ga")  # pyright: ignore[reportArgumentType]
+
+
 @pytest.mark.parametrize("wrong", ["ga", gavo.AlignmentOptions(), gavo.GaussNewton])
 def test_anything_else_is_told(wrong):
     with pytest.raises(TypeError, match="neither Settings nor a solver"):
