@@ -18,13 +18,11 @@ from gavo_jax.trajectory import inverse
 
 COLUMNS = 60
 """Points across an image, on a regular grid: high-contrast points would lie on the edges of objects."""
-SMALLEST_CHANGE = 0.01
-"""Difference between motion and rest, 1/m, above which a point is informative: three times the noise of a
-structured-light sensor.
-"""
+SMALLEST_CHANGE = (0.01, 0.02)
+"""Difference between motion and rest, 1/m, above which a point is informative, with fine and with coarse depth."""
 STEPS, BESIDE, USUAL = 3.0, 2, 0.75
-"""The same where depth has steps: so many times the departure from a plane within `BESIDE` pixels, at this quantile. On
-the TUM clips that is 0.003 /m, the sensor's noise.
+"""That difference over depth's departure from a plane within `BESIDE` pixels, at this quantile. The departure is 0.003
+/m on the TUM clips, the noise of a structured-light sensor.
 """
 CHANGED = 0.25
 """Share of all points that is used: those at which motion and rest differ most."""
@@ -175,7 +173,8 @@ def left_unexplained(
     at_motion = (seen - q / np.where(inside, moved[2], 1.0))[inside]
     at_rest = (unmoved - q)[inside]
     apart = np.abs(at_motion - at_rest)
-    least = max(SMALLEST_CHANGE, STEPS * step_of(depth, camera), float(np.quantile(apart, 1.0 - CHANGED)))
+    smallest = np.clip(STEPS * step_of(depth, camera), *SMALLEST_CHANGE)
+    least = max(float(smallest), float(np.quantile(apart, 1.0 - CHANGED)))
     telling = apart > least
     if np.count_nonzero(telling) < LEAST_POINTS:
         return np.nan
