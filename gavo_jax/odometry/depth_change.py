@@ -18,11 +18,9 @@ from gavo_jax.trajectory import inverse
 
 COLUMNS = 60
 """Points across an image, on a regular grid: high-contrast points would lie on the edges of objects."""
-SMALLEST_CHANGE = (0.01, 0.02)
-"""Difference between motion and rest, 1/m, above which a point is informative, with fine and with coarse depth."""
-STEPS, BESIDE, USUAL = 3.0, 2, 0.75
-"""That difference over depth's departure from a plane within `BESIDE` pixels, at this quantile. The departure is 0.003
-/m on the TUM clips, the noise of a structured-light sensor.
+SMALLEST_CHANGE = 0.01
+"""Difference between motion and rest, 1/m, above which a point is informative: three times the noise of a
+structured-light sensor.
 """
 CHANGED = 0.25
 """Share of all points that is used: those at which motion and rest differ most."""
@@ -173,36 +171,10 @@ def left_unexplained(
     at_motion = (seen - q / np.where(inside, moved[2], 1.0))[inside]
     at_rest = (unmoved - q)[inside]
     apart = np.abs(at_motion - at_rest)
-    smallest = np.clip(STEPS * step_of(depth, camera), *SMALLEST_CHANGE)
-    least = max(float(smallest), float(np.quantile(apart, 1.0 - CHANGED)))
-    telling = apart > least
+    telling = apart > max(SMALLEST_CHANGE, float(np.quantile(apart, 1.0 - CHANGED)))
     if np.count_nonzero(telling) < LEAST_POINTS:
         return np.nan
     return float(np.median(np.abs(at_motion[telling])) / max(np.median(np.abs(at_rest[telling])), 1e-9))
-
-
-def step_of(depth: np.ndarray, camera: Camera) -> float:
-    """Return how far inverse depth usually departs from a plane within a few pixels, 1/m: its noise, or its steps.
-
-    Depth has steps if it was enlarged without interpolation, or stored in few bits. They stay where they are in the
-    image, so that a camera at rest explains them best.
-    """
-    row, column = (places[::2, ::2] for places in _grid(camera))
-    departures = []
-    for down, along in ((BESIDE, 0), (0, BESIDE)):
-        before, here, after = (
-            inverse_depth(
-                depth[
-                    np.clip(row + times * down, 0, camera.height - 1),
-                    np.clip(column + times * along, 0, camera.width - 1),
-                ],
-                camera,
-            )
-            for times in (-1, 0, 1)
-        )
-        departures.append(np.abs(before + after - 2 * here)[(before > 0) & (here > 0) & (after > 0)])
-    known = np.concatenate(departures)
-    return float(np.quantile(known, USUAL)) if known.size else 0.0
 
 
 def _is_one_number(inverse: Float64[np.ndarray, "rows columns"]) -> bool:

@@ -6,7 +6,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from small import CAMERA, Rendered, StandIn
 
 from gavo_jax.alignment.result import no_alignment, with_finding
 from gavo_jax.bodies.records import Seen
-from gavo_jax.camera import Camera, to_ray
 from gavo_jax.datasets.base import Frame
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.depth_change import (
@@ -30,7 +28,6 @@ from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.output.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from gavo_jax.rigid_motions import exp
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
@@ -211,29 +208,6 @@ def test_nothing_is_known_without_readings_or_without_motion(depth: np.ndarray) 
     assert np.isnan(left_unexplained(seen, frames[0].depth, np.eye(4), CAMERA))
     assert left_unexplained(seen, frames[5].depth, motion, CAMERA) < 0.5
     assert left_unexplained(seen, frames[5].depth, inverse(motion), CAMERA) > 1.0
-
-
-@pytest.mark.parametrize("columns", [256, 160])
-def test_steps_of_enlarged_depth_say_nothing(columns: int) -> None:
-    """Each of its pixels covers several of the image, and stays there while a camera turns slowly along a wall."""
-    camera = Camera(525.0, 525.0, 319.5, 239.5, 640, 480)
-    wall = np.array([1.6, 0.0, 1.2])  # points X with wall · X = 1
-
-    def seen(wall: np.ndarray, columns: int) -> np.ndarray:
-        row, column = np.mgrid[:480, :640]
-        x, y = to_ray(camera, column, row)
-        depth = (5000.0 / (wall[0] * x + wall[1] * y + wall[2])).astype(np.float32)
-        small = cv2.resize(depth, (columns, columns * 3 // 4), interpolation=cv2.INTER_NEAREST)
-        return np.round(cv2.resize(small, (640, 480), interpolation=cv2.INTER_NEAREST)).astype(np.uint16)
-
-    def left(columns: int, angle: float) -> float:
-        turned = exp(np.radians([0.0, 0.0, 0.0, 0.0, angle, 0.0]))
-        before, after = (seen(normal, columns) for normal in (wall, turned[:3, :3] @ wall))
-        frame = Frame(np.zeros((480, 640), np.uint8), before, 0.0)
-        return left_unexplained(depth_on_grid(frame, camera), after, turned, camera)
-
-    assert np.isnan(left(columns, 0.28))
-    assert left(columns, 4.0) < 0.3 and left(640, 4.0) < 0.1
 
 
 def test_no_more_is_remembered_than_tells_and_it_survives_a_checkpoint(tmp_path: Path) -> None:
