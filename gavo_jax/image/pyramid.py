@@ -20,8 +20,8 @@ LEVELS = 5
 EDGE_TOLERANCE = 0.03
 
 STEEPEST = 20.0
-"""Change of inverse depth from a pixel to the next, as a share of it and times the pixels of the image's longer side,
-above which the two are of two surfaces: that of a surface seen at about 4 degrees. The share is at least
+"""Relative change of inverse depth from a pixel to the next above which the two are of two surfaces, times the pixels
+of the image's longer side. One surface changes as much if it is seen at about 4 degrees. The change is at least
 `EDGE_TOLERANCE`."""
 
 
@@ -71,11 +71,10 @@ def halve_inverse_depth(inverse_depth: Float[Array, "h w"]) -> Float[Array, "h2 
 
 
 def without_mixed_readings(inverse_depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
-    """Drop readings between two surfaces, or between one and no reading: no neighbour along u or along v is like them.
+    """Drop readings between two surfaces, or between one and no reading: both neighbours along u or v are unlike them.
 
-    A time-of-flight camera mixes what its pixel sees at a boundary ("flying pixels"). So does whoever resizes or
-    undistorts depth by interpolation. They would be points where nothing is, and at the image's edges, which the search
-    prefers.
+    A time-of-flight camera mixes what a pixel sees at a boundary ("flying pixels"); so does interpolation, when depth
+    is resized or undistorted. The search would prefer such points, which lie where nothing is but at the image's edges.
     """
     tolerance = max(EDGE_TOLERANCE, STEEPEST / max(inverse_depth.shape))
     around = jnp.pad(inverse_depth, 1)

@@ -78,8 +78,9 @@ class Bag:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files of the recording."""
-        return (self.path,) if self.path.is_file() else tuple(sorted(filter(Path.is_file, self.path.iterdir())))
+        """The files of the recording with messages, compressed ones too."""
+        files = [self.path] if self.path.is_file() else sorted(self.path.iterdir())
+        return tuple(path for path in files if set(path.suffixes) & set(SUFFIXES))
 
     def stream(self, names: list[str], start: int | None = None) -> Iterator[tuple[str, bytes, str]]:
         """Topic, content and type of messages in the order of their arrival, from time `start` (ns) on."""
