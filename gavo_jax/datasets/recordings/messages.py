@@ -193,13 +193,18 @@ def _pixels(message: Any, name: str) -> np.ndarray:
 
 def is_calibrated(info: Any) -> bool:
     """Whether a camera_info holds a calibration: drivers without one send zeros."""
-    return info.width > 0 and any(getattr(info, "k", getattr(info, "K", ())))
+    return info.width > 0 and any(_numbers(info, "k"))
 
 
 def intrinsics(info: Any) -> list[float]:
     """Return fx, cx, fy, cy, width and height of a camera_info."""
-    matrix = getattr(info, "k", getattr(info, "K", ()))
-    return [float(number) for number in (*(matrix[place] for place in (0, 2, 4, 5)), info.width, info.height)]
+    fx, _, cx, _, fy, cy, *_ = _numbers(info, "k")
+    return [fx, cx, fy, cy, float(info.width), float(info.height)]
+
+
+def _numbers(info: Any, name: str) -> list[float]:
+    """Return the numbers of a camera_info's field: k, d or p, which ROS 1 writes K, D and P."""
+    return [float(value) for value in getattr(info, name, getattr(info, name.upper(), ()))]
 
 
 def camera_table(info: Any, rectified: bool) -> dict[str, Any]:
@@ -209,11 +214,7 @@ def camera_table(info: Any, rectified: bool) -> dict[str, Any]:
         info: the message, of ROS 1 (K, D, P) or ROS 2 (k, d, p).
         rectified: whether the images are free of distortion, so that the projection matrix applies.
     """
-
-    def numbers(name: str) -> list[float]:
-        return [float(value) for value in getattr(info, name, getattr(info, name.upper(), ()))]
-
-    k, d, p = numbers("k"), numbers("d"), numbers("p")
+    k, d, p = (_numbers(info, name) for name in ("k", "d", "p"))
     size = {"width": int(info.width), "height": int(info.height)}
     if rectified and any(p):
         return {"fx": p[0], "fy": p[5], "cx": p[2], "cy": p[6], **size}

@@ -5,7 +5,7 @@ import io
 import itertools
 import struct
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -230,7 +230,7 @@ class Bag:
             others = [self._reader.deserialize(*content) for content in distinct.values()]
         numbers = [intrinsics(one) for one in (info, *others) if is_calibrated(one)]
         for other in numbers[1:]:
-            if not np.allclose(other, numbers[0], rtol=0, atol=ROUNDED):
+            if not _are_alike(other, numbers[0]):
                 fx = f"fx is {numbers[0][0]:g} at first, {other[0]:g} later"
                 raise GavoError(
                     f"{self.path}: {name}: the camera changes within the recording ({fx}): pass --camera with one that "
@@ -310,5 +310,9 @@ def _stamp(raw: Any, is_2: bool) -> float:
 
 def _is_same(a: Camera, b: Camera) -> bool:
     """Whether two cameras have the same size and intrinsics (not distortion), up to rounding."""
-    numbers = [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in (a, b)]
-    return bool(np.allclose(*numbers, rtol=0, atol=ROUNDED))
+    return _are_alike(*((c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in (a, b)))
+
+
+def _are_alike(a: Iterable[float], b: Iterable[float]) -> bool:
+    """Whether the numbers of two cameras agree up to rounding."""
+    return bool(np.allclose(list(a), list(b), rtol=0, atol=ROUNDED))
