@@ -78,8 +78,11 @@ def _open(path: Path) -> int:
     careful = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
         file = os.open(path, os.O_RDWR | os.O_CREAT | careful, 0o644)
-    except PermissionError:  # left by another user's killed process: reading is enough to lock it
-        file = os.open(path, os.O_RDONLY | careful)
+    except PermissionError as refused:  # left by another user's killed process: reading is enough to lock it
+        try:
+            file = os.open(path, os.O_RDONLY | careful)
+        except FileNotFoundError:  # a folder that may not be written to
+            raise refused from None
     if not stat.S_ISREG(os.fstat(file).st_mode):
         os.close(file)
         raise OSError("not a file")

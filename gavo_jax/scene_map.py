@@ -52,12 +52,12 @@ OFF_THE_GRID = 1.000001
 """Factor on depth that moves surfaces off the voxels: Open3D cannot tell the sides of one that lies exactly on them."""
 
 MIN_WEIGHT = 3.0
-"""Frames that must have seen a voxel for it to count; fewer where the run has fewer."""
+"""More frames than this must have seen a voxel for it to count; fewer where the run has fewer."""
 
 
 @dataclass(frozen=True, eq=False)
 class SceneMap:
-    """Map of a segment of a run, in the frame of the segment's first camera, metres.
+    """Map of a segment of a run, in the run's world (the frame of its first camera), metres.
 
     Attributes:
         points: points of the cloud, or vertices of the mesh.
@@ -255,6 +255,9 @@ class LiveMap:
         if self._segment is None and step.alignment.status == AlignmentStatus.NO_REFERENCE:
             self._reasons[LOST] += 1  # the frame before
             self._first = frame, step.world_T_camera, step.segment
+            return
+        if self._segment is None and step.lost:  # the first frame may be at fault: it waits for one that fits it
+            self._reasons[LOST] += 1
             return
         self._begin()
         why = _why_not(step)

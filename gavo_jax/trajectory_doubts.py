@@ -58,7 +58,8 @@ def relative_size(estimate: Trajectory, truth: Trajectory) -> float | None:
     known = covered & np.isfinite(estimate.world_T_camera).all(axis=(1, 2)) & np.isfinite(true).all(axis=(1, 2))
     if not known.any():
         return None
-    chosen = known & (estimate.segments == np.bincount(estimate.segments[known]).argmax())
+    numbers, sizes = np.unique(estimate.segments[known], return_counts=True)
+    chosen = known & (estimate.segments == numbers[sizes.argmax()])
     points, targets = estimate.world_T_camera[chosen, :3, 3], true[chosen, :3, 3]
     if len(points) < FEWEST_POSES:
         return None

@@ -90,6 +90,20 @@ def test_what_is_planted_in_its_place_is_neither_followed_nor_waited_for(tmp_pat
             pytest.fail("no file")
 
 
+def test_a_folder_that_may_not_be_written_to_is_named_as_such(tmp_path, monkeypatch):
+    """It was told "No such file": of the second try, to lock a file of another user's by reading."""
+    start = os.open
+
+    def unless_made(path, flags, mode=0o777):
+        if flags & os.O_CREAT:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return start(path, flags, mode)
+
+    monkeypatch.setattr(os, "open", unless_made)
+    with pytest.raises(GavoError, match="cannot be written: Permission denied"), hold(tmp_path):
+        pass
+
+
 def test_a_file_system_without_locks_is_told(tmp_path, monkeypatch):
     def flock(*arguments: object) -> None:
         raise OSError(errno.ENOLCK, "No locks available")

@@ -29,7 +29,7 @@ GREY_SCALE = 15.0
 DEPTH_SCALE = 0.02
 """Inverse-depth residual of a match, 1/m: a few times the quantisation of a structured-light sensor."""
 NOISES = tuple(product((2.0, 4.0, 8.0, GREY_SCALE), (0.003, 0.006, 0.01, DEPTH_SCALE)))
-"""Pairs of scales (grey, inverse depth) of the noise that may explain a refined motion."""
+"""Pairs of scales (grey, inverse depth) of the noise that may explain a refined motion. The widest one comes last."""
 LEAST_GREY_SPREAD, LEAST_DEPTH_SPREAD = 20.0, 0.05
 """Lower bounds on the difference of two random pixels of a frame (grey levels, 1/m)."""
 MISMATCH = 0.2
@@ -69,27 +69,31 @@ class Held(NamedTuple):
 
 def evidence(objective: Objective, target_T_reference: Float[Array, "4 4"], points: int = POINTS) -> Evidence:
     """Return the evidence for one motion from both directions of an objective, ignoring its scales and brightness."""
-    return _evidence(objective, target_T_reference, points, ((GREY_SCALE, DEPTH_SCALE),))
+    by_noise = _evidence(objective, target_T_reference, points, ((GREY_SCALE, DEPTH_SCALE),))
+    return Evidence(*(of[0] for of in by_noise))
 
 
-def evidence_at_best(objective: Objective, target_T_reference: Float[Array, "4 4"]) -> Evidence:
-    """Return the evidence for one refined motion under the noise that explains it best."""
-    return _evidence(objective, target_T_reference, POINTS, NOISES)
+def evidence_and_best(objective: Objective, target_T_reference: Float[Array, "4 4"]) -> tuple[Evidence, Evidence]:
+    """Return the evidence for one refined motion, and that under the noise that explains it best."""
+    by_noise = _evidence(objective, target_T_reference, POINTS, NOISES)
+    return Evidence(*(of[-1] for of in by_noise)), Evidence(*map(jnp.max, by_noise))
 
 
 def _evidence(
     objective: Objective, motion: Float[Array, "4 4"], points: int, noises: tuple[tuple[float, float], ...]
-) -> Evidence:
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Return total and seen evidence of a motion under each noise."""
     scales = jnp.array(noises)
     sums = _sums(objective, motion, points, scales)
     if objective.backward is not None:
         sums = jax.tree.map(jnp.add, sums, _sums(objective.backward, rigid_inverse(motion), points, scales))
     totals, seen, readings = sums
-    total = jnp.max(totals)
-    return Evidence(total / jnp.maximum(readings, 1.0), total / jnp.maximum(seen, LEAST_SEEN * readings + 1.0))
+    return totals / jnp.maximum(readings, 1.0), totals / jnp.maximum(seen, LEAST_SEEN * readings + 1.0)
 
 
-def is_held(objective: Objective, target_T_reference: Float[Array, "4 4"], directions: Float[Array, "6 6"]) -> Held:
+def is_held(
+    objective: Objective, target_T_reference: Float[Array, "4 4"], here: Evidence, directions: Float[Array, "6 6"]
+) -> Held:
     """Test whether the evidence falls on both sides of a motion, along directions of a step on the reference's side.
 
     Gradients of frames far apart agree little, which alone can make a direction seem undetermined. The test is then
@@ -98,14 +102,15 @@ def is_held(objective: Objective, target_T_reference: Float[Array, "4 4"], direc
     Args:
         objective: Objective of the level that the evidence is taken on.
         target_T_reference: The motion.
+        here: The evidence for it.
         directions: Directions as columns, metres and radians, of any length.
     """
     size = jnp.repeat(jnp.stack([jnp.float32(step) for step in STEP]), 3)
     steps = directions / jnp.max(jnp.abs(directions) / size[:, None], axis=0)
     aside = target_T_reference @ exp(jnp.concatenate([steps.T, -steps.T]))
     fallen = jax.lax.map(lambda motion: evidence(objective, motion).total, aside, batch_size=12)
-    here = evidence(objective, target_T_reference).total
-    return Held(jnp.all(fallen.reshape(2, 6) < here - LEAST_FALL * jnp.abs(here), axis=0), steps)
+    least = here.total - LEAST_FALL * jnp.abs(here.total)
+    return Held(jnp.all(fallen.reshape(2, 6) < least, axis=0), steps)
 
 
 def _sums(

@@ -220,8 +220,8 @@ def _weigh(
     """
     if judge is None:
         return examination, _covariance(examination, objective, None) + added, None
-    held = is_held(judge, examination.motion, examination.information.directions)
     chosen_by = evidence(judge, examination.motion)
+    held = is_held(judge, examination.motion, chosen_by, examination.information.directions)
     covariance = _covariance(examination, objective, held) + added
     determined = examination.information.determined | held.held
     examination = examination._replace(information=examination.information._replace(determined=determined))

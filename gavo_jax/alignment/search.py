@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Integer, PRNGKeyArray
 
 from gavo_jax.alignment.aliases import self_motions
 from gavo_jax.alignment.contest import Entry, hold_contest
-from gavo_jax.alignment.evidence import evidence, evidence_at_best
+from gavo_jax.alignment.evidence import evidence, evidence_and_best
 from gavo_jax.alignment.fitting import comparable_objective, fit_objective, level_objective, unchanged_brightness
 from gavo_jax.alignment.judgement import Part, Winner, conclude
 from gavo_jax.alignment.modes import best_distinct, rival_error
@@ -217,7 +217,7 @@ def _search_in_contest(
     def refine(motion: jax.Array, is_last: jax.Array) -> Entry:
         search = _refine_through_levels(frames, visits, motion, box, is_last)
         found = search.islands[0]
-        return Entry(found, evidence(judge, found), evidence_at_best(judge, found), search.brightness)
+        return Entry(found, *evidence_and_best(judge, found), search.brightness)
 
     aliases = jnp.full((1, 4, 4), jnp.nan)
     if exchanged is not None:

@@ -23,7 +23,7 @@ from gavo_jax.bodies.scene import AwareState, FrameView, MotionSegmenter
 from gavo_jax.bodies.surfaces import whole_surfaces
 from gavo_jax.datasets.base import Frame
 from gavo_jax.frame_checks import MAX_INTERVAL_RATIO
-from gavo_jax.odometry.aligners import Aligner, Attempt, FrameSearch, agree, side_by_side
+from gavo_jax.odometry.aligners import Aligner, Attempt, FrameSearch, agree, is_motion_known, side_by_side
 from gavo_jax.odometry.plausibility import depth_alone_disagrees
 from gavo_jax.odometry.tracking import Clock, TrackerState, as_exposed
 from gavo_jax.rigid_motions import exp, log
@@ -120,7 +120,7 @@ class BodyAware:
         state = self.blank_state()
 
         def look() -> None:
-            jax.block_until_ready(self.segmenter.look(state.scene, state.tracker, np.eye(4)))
+            jax.block_until_ready(self.segmenter.look(state.scene, state.tracker, np.eye(4), 0.0))
 
         return side_by_side(self.first.warm_up, look)
 
@@ -154,10 +154,10 @@ class BodyAware:
         if not self.is_eager and self._asks(first, seen, found, before):
             attempt, seconds_extrapolated = self._asked(state, frame, clock, seen)
         is_vague = attempt.usable and not seconds_extrapolated and deviation(attempt) > MIN_VELOCITY_DEVIATIONS[0]
-        if not self.is_eager and is_vague and np.any(before):
+        if not self.is_eager and is_vague and is_motion_known(state.tracker) and np.any(before):
             attempt = self._fused_with_prediction(state, clock, attempt)
         if attempt is not seen:
-            look = self._look(state, attempt)
+            look = self._look(state, clock, attempt)
             found = _bodies(look.belief, before, depth_disagrees)
         return self._remember(state, frame, clock, attempt, look, found, seconds_extrapolated)
 
@@ -184,7 +184,8 @@ class BodyAware:
         """
         attempt, before = self._share_out(state, frame, clock, seen), state.scene.seconds_extrapolated
         has_missed = float(clock.elapsed) > MAX_INTERVAL_RATIO * float(state.tracker.seconds)
-        if attempt.usable or has_missed or not before < MAX_SECONDS_EXTRAPOLATED:
+        is_predicted = is_motion_known(state.tracker) and not has_missed and before < MAX_SECONDS_EXTRAPOLATED
+        if attempt.usable or not is_predicted:
             return attempt, 0.0
         covered = float(np.mean(np.asarray(state.scene.tracks.labels) > 0))
         helped = self._helped_by_prediction(state, clock, attempt, covered)
@@ -237,7 +238,7 @@ class BodyAware:
         Returns:
             The attempt to keep, and how the frame looks under its motion.
         """
-        look = self._look(state, attempt)
+        look = self._look(state, clock, attempt)
         for _ in range(ROUNDS):
             opinion = look.opinion
             if opinion is None or not float(opinion.dissent) > MAX_DISSENT_RATIO * float(opinion.least):
@@ -245,14 +246,14 @@ class BodyAware:
             again = self.search.align(self._without(state.tracker, opinion, clock), frame, clock)
             if not again.usable:
                 break
-            other = self._look(state, again)
+            other = self._look(state, clock, again)
             if other.opinion is None or MIN_REPLACEMENT_RATIO * float(other.opinion.dissent) > float(opinion.dissent):
                 break
             attempt, look = again, other
         return attempt, look
 
-    def _look(self, state: AwareState, attempt: Attempt) -> FrameView:
-        return self.segmenter.look(state.scene, attempt.state, attempt.result.target_T_reference)
+    def _look(self, state: AwareState, clock: Clock, attempt: Attempt) -> FrameView:
+        return self.segmenter.look(state.scene, attempt.state, attempt.result.target_T_reference, float(clock.elapsed))
 
     def _without(self, tracker: TrackerState, opinion: Opinion, clock: Clock) -> TrackerState:
         """A tracker without the dissenting points, whose search starts from the motion that the others ask for."""

@@ -120,10 +120,12 @@ def suspect(
         bodies: Where the frame shows bodies.
         elapsed: Seconds since the last frame.
         trusted: Whether the camera's motion is trusted. If not, nothing is learnt: under a wrong motion the scene seems
-            to move.
+            to move, and a body to be at rest.
     """
+    if not trusted:
+        return np.asarray(belief.suspected, np.float32)
     before = np.where(np.asarray(belief.known) < RELEASED, 0.0, np.asarray(belief.suspected))
-    return np.asarray(np.maximum(np.exp(-elapsed / FADING) * before, bodies) if trusted else before, np.float32)
+    return np.asarray(np.maximum(np.exp(-elapsed / FADING) * before, bodies), np.float32)
 
 
 def _weigh(e: PixelEvidence) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:

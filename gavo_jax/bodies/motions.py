@@ -51,7 +51,7 @@ def find_motions(
         if number == 0 or age > 0 or not np.any(part):
             continue
         alignment = None
-        if search is not None and np.any(before.labels == number):
+        if search is not None and np.any(before.numbers[before.ages == 0] == number):  # else its label is elsewhere
             alignment = _align(search, segmenter, state, frame, clock, before, int(number))
             is_known = alignment.status == AlignmentStatus.OK
             tracks.motions[place] = alignment.xi if is_known else 0.0

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple, Self
 
 import cv2
@@ -54,7 +53,7 @@ class Body:
     size: tuple[int, int]
     """Height and width of the image."""
 
-    @cached_property
+    @property  # not kept: a run's masks would fill the memory
     def mask(self) -> Bool[np.ndarray, "height width"]:
         """Pixels of the undistorted image that the body covers."""
         return self.mask_at(self.size)

@@ -132,9 +132,9 @@ class MotionSegmenter:
         image = jax.tree.map(np.asarray, tracker.previous_image)
         return view_of(image, self.levels, sweep)
 
-    def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any) -> FrameView:
+    def look(self, scene: Scene, tracker: TrackerState, target_T_reference: Any, elapsed: float) -> FrameView:
         """The belief about a new frame's pixels under a motion, and the last frame's opinion on that motion."""
-        keep = (1, 2) if _age_after(scene, float(tracker.seconds)) else (2, 0)
+        keep = (1, 2) if _age_after(scene, elapsed) else (2, 0)
         return _look(
             (scene.known, scene.suspected, scene.views, scene.views_T_last),
             (tracker.previous_image, tracker.instant_motion, tracker.seconds),

@@ -145,6 +145,12 @@ def _without_drift(summaries: Sequence[Summary]) -> list[str]:
     short, blind = ([name for name in none if (name in by_frame) is known] for known in (True, False))
     lost = [summary for summary in summaries if summary.drift is None and summary.sequence in told]
     notes = [f"No drift of {one.sequence} by {one.label}: no tracked part lasts 1 s." for one in lost]
+    some = [summary for summary in summaries if 0 < summary.known < summary.runs]
+    notes += [
+        f"No drift of {one.sequence} by {one.label} in {one.runs - one.known} of {one.runs} runs, which count as "
+        "infinite: no tracked part lasts 1 s."
+        for one in some
+    ]
     notes += [f"No drift of {', '.join(short)}: no two frames that the truth covers are 1 s apart."] if short else []
     return notes + ([f"No errors of {', '.join(blind)}: no ground truth covers it."] if blind else [])
 

@@ -28,8 +28,7 @@ from gavo_jax.early import INTERRUPTED, LOST
 from gavo_jax.errors import print_message
 from gavo_jax.inspection import left_out, left_out_in_short, summary
 from gavo_jax.interrupts import interruptible
-from gavo_jax.mapping.background import BackgroundMapper
-from gavo_jax.mapping.mapper import Mapper
+from gavo_jax.mapping.background import BackgroundMapper, mapper_of
 from gavo_jax.odometry.composition import blank_of
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
@@ -70,7 +69,7 @@ def run(options: Run) -> int:
     path = options.output or Path("runs") / name
     viewer = make_viewer(options.viewer, path / RECORDING)
     be_ready()
-    mapper = BackgroundMapper(Mapper(sequence.camera)) if settings.odometry.loops else None
+    mapper = mapper_of(sequence.camera, settings.odometry)
     poses = ODOMETRY if mapper else TRAJECTORY
     with RunFolder(path, getattr(sequence, "files", ()), poses) as folder, viewer:
         odometry = Odometry(
@@ -85,7 +84,8 @@ def run(options: Run) -> int:
         metrics, interrupted = folder.finished() if options.resume else None, False
         if metrics is not None:
             shown = "" if options.viewer == "none" else f"; gavo view {folder.path} shows it"
-            print_message(f"{folder.path}: the run is already complete: nothing to resume{shown}")
+            ended = "is already complete" if metrics.get("complete", True) else "ended at its first lost pair"
+            print_message(f"{folder.path}: the run {ended}: nothing to resume{shown}")
             _draw_if_missing(options, sequence, folder)
         else:
             # before an earlier run is replaced, as opening may fail

@@ -153,14 +153,18 @@ def configuration(run: Run, frames: Mapping[str, Any]) -> dict[str, Any]:
 def frames_of(name: str, sequence: FrameSequence) -> dict[str, Any]:
     """Describe a sequence's frames, camera and ground truth by value, without file paths.
 
-    Hashes of the first, middle and last image tell apart recordings of the same name, timestamps and camera.
+    Hashes of the first, middle and last image, and of when their depth was taken, tell apart recordings of the same
+    name, timestamps and camera.
     """
     stamps = np.ascontiguousarray(sequence.timestamps, np.float64)
-    images, truth = hashlib.sha256(), sequence.ground_truth
+    images, truth, true_poses = hashlib.sha256(), sequence.ground_truth, hashlib.sha256()
+    for part in () if truth is None else (truth.world_T_camera, truth.timestamps, truth.segments):
+        true_poses.update(np.ascontiguousarray(part).tobytes())
     for index in sorted({0, len(sequence) // 2, len(sequence) - 1}):
         try:
             frame = sequence[index]
             images.update(np.asarray(frame.grey).tobytes() + np.asarray(frame.depth).tobytes())
+            images.update(np.float64(frame.depth_delay).tobytes())
         except FrameError:
             images.update(b"unreadable")
     return {
@@ -171,5 +175,5 @@ def frames_of(name: str, sequence: FrameSequence) -> dict[str, Any]:
         "timestamps_sha256": hashlib.sha256(stamps.tobytes()).hexdigest(),
         "camera": sequence.camera,
         "images_sha256": images.hexdigest(),
-        "truth_sha256": None if truth is None else hashlib.sha256(truth.world_T_camera.tobytes()).hexdigest(),
+        "truth_sha256": None if truth is None else true_poses.hexdigest(),
     }

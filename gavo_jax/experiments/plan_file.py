@@ -147,13 +147,14 @@ def _part(place: str, beside: Path, folder: str, entry: Mapping[str, Any]) -> Pa
     camera = text_of(f"{place}: camera", entry.get("camera", "auto"))
     try:
         if os.path.isfile(beside / camera):
-            camera = str(beside / camera)
+            camera = str((beside / camera).resolve())
     except GavoError as error:
         raise GavoError(f"{place}: camera: {one_line(error)}") from None
     name = entry.get("name", Path(folder).resolve().name if folder != SYNTHETIC else SYNTHETIC)
     if "name" not in entry and (start, frames, stride) != (0, None, 1):
         name = f"{name}[{start}:{'' if frames is None else start + frames * stride}:{stride}]"
-    return Part(text_of(f"{place}: name", name), folder, camera, start, frames, stride)
+    path = folder if folder == SYNTHETIC else os.path.abspath(folder)  # workers may run elsewhere
+    return Part(text_of(f"{place}: name", name), path, camera, start, frames, stride)
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,13 @@ class Summary(NamedTuple):
     label: str
     runs: int
     drift: tuple[float, float, float] | None
-    """Lower quartile, median and upper quartile of the drift, m/s; None where there is no ground truth."""
+    """Lower quartile, median and upper quartile of the drift, m/s; None where no run has one. Where others have one, a
+    run without, of a camera that was lost, counts as infinite.
+    """
+    known: int
+    """Number of runs with a drift."""
     rotation: float | None
-    """Median of the rotational drift, deg/s; None where there is no ground truth."""
+    """Median of the rotational drift, deg/s, of the same runs."""
     per_frame: float | None
     """Median of the translational error per frame, m; None where there is no ground truth."""
     lost: int
@@ -55,16 +59,17 @@ def summarise(rows: Iterable[Row]) -> list[Summary]:
 
 
 def _summary(sequence: str, label: str, rows: Sequence[Row]) -> Summary:
-    drifts = [row[DRIFT] for row in rows if row[DRIFT] is not None]
-    turns = [row[ROTATION_DRIFT] for row in rows if row[ROTATION_DRIFT] is not None]
+    drifts, turns = ([np.inf if row[name] is None else row[name] for row in rows] for name in (DRIFT, ROTATION_DRIFT))
     steps = [row[DRIFT_PER_FRAME] for row in rows if row[DRIFT_PER_FRAME] is not None]
-    quartiles = np.quantile(drifts, (0.25, 0.5, 0.75)).tolist() if drifts else None
+    method = "linear" if np.all(np.isfinite(drifts)) else "higher"  # nothing lies between a number and infinity
+    quartiles = np.quantile(drifts, (0.25, 0.5, 0.75), method=method).tolist() if min(drifts) < np.inf else None
     return Summary(
         sequence,
         label,
         len(rows),
         None if quartiles is None else (quartiles[0], quartiles[1], quartiles[2]),
-        float(np.median(turns)) if turns else None,
+        sum(drift < np.inf for drift in drifts),
+        float(np.median(turns)) if quartiles else None,
         float(np.median(steps)) if steps else None,
         max(row["lost_pairs"] for row in rows),
         float(np.median([1e3 / row[FRAMES_PER_SECOND] for row in rows])),
@@ -76,15 +81,18 @@ def compare(rows: Sequence[Row], earlier: Collection[str] = ()) -> list[Comparis
     """Compare every two labels on each sequence, and over all sequences if there are several.
 
     A method that ran only once on a sequence is compared with every seed of the other. A single pair is not compared.
+    A run without a drift, of a camera that was lost, is worse than any with one.
 
     Args:
         rows: Rows in which a sequence's name always stands for the same frames, and a label for the same settings.
         earlier: Sequences of earlier versions of the experiment's file, left out of the comparison over all.
     """
     drifts: dict[str, dict[str, dict[Any, float]]] = {}
+    known = {row["sequence"] for row in rows if row[DRIFT] is not None}
     for row in rows:
-        if row[DRIFT] is not None:
-            drifts.setdefault(row["label"], {}).setdefault(row["sequence"], {})[row["seed"]] = row[DRIFT]
+        if row["sequence"] in known:
+            drift = np.inf if row[DRIFT] is None else row[DRIFT]
+            drifts.setdefault(row["label"], {}).setdefault(row["sequence"], {})[row["seed"]] = drift
     sequences = list(dict.fromkeys(row["sequence"] for row in rows))
     found = []
     for first, second in itertools.combinations(drifts, 2):
@@ -97,10 +105,12 @@ def compare(rows: Sequence[Row], earlier: Collection[str] = ()) -> list[Comparis
 
 def _matched(first: Mapping[Any, float], second: Mapping[Any, float]) -> list[tuple[float, float]]:
     if len(first) == 1:
-        return [(next(iter(first.values())), value) for value in second.values()]
-    if len(second) == 1:
-        return [(value, next(iter(second.values()))) for value in first.values()]
-    return [(first[seed], second[seed]) for seed in first if seed in second]
+        pairs = [(next(iter(first.values())), value) for value in second.values()]
+    elif len(second) == 1:
+        pairs = [(value, next(iter(second.values()))) for value in first.values()]
+    else:
+        pairs = [(first[seed], second[seed]) for seed in first if seed in second]
+    return [pair for pair in pairs if min(pair) < np.inf]
 
 
 def _test(sequence: str, first: str, second: str, pairs: Sequence[tuple[float, float]]) -> Comparison:

@@ -60,7 +60,8 @@ class Table:
 
     def done(self) -> set[str]:
         """Return the hashes of the runs in the table."""
-        return {path.stem for path in self.folder.glob(f"*{SUFFIX}") if not path.name.startswith(".")}
+        files = (path for path in self.folder.glob(f"*{SUFFIX}") if not path.name.startswith("."))
+        return {path.stem for path in files if path.stat().st_size}
 
     def append(self, row: Mapping[str, Any]) -> None:
         """Add a row atomically, replacing any row of the same run.
@@ -79,6 +80,8 @@ class Table:
             parquet.write_table(
                 _arrow().table(values, schema=schema), partial, use_dictionary=False, write_statistics=False
             )
+            with partial.open("rb+") as file:  # else a power cut may leave the name of an empty file
+                os.fsync(file.fileno())
             os.replace(partial, self.folder / f"{row['run']}{SUFFIX}")
         except OSError as error:
             partial.unlink(missing_ok=True)

@@ -22,7 +22,7 @@ from jaxtyping import Float64
 from gavo_jax.alignment.result import Alignment, on_host
 from gavo_jax.camera import Camera
 from gavo_jax.compilation.precision import in_32_bits
-from gavo_jax.compilation.waits import Stopwatch
+from gavo_jax.compilation.waits import Stopwatch, counted_map
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.rectified import rectified
@@ -60,7 +60,7 @@ def track_together(
     with ThreadPoolExecutor(workers) as pool:
 
         def register(frame: Frame | FrameError, timestamp: float) -> list[Step | None]:
-            return list(pool.map(lambda odometry: odometry.register(frame, timestamp), odometries))
+            return counted_map(pool, lambda odometry: odometry.register(frame, timestamp), odometries)
 
         return _drive(sequence, odometries, register, on_frame)
 

@@ -9,10 +9,13 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, ParamSpec, TypeVar
 
+from gavo_jax.camera import Camera
 from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.datasets.base import Frame, Sequence
 from gavo_jax.mapping.mapper import Loops, Mapper
 from gavo_jax.odometry.driver import Found, Moving, Step, seen_moving
+from gavo_jax.odometry.tracking import as_exposed
+from gavo_jax.settings import OdometryOptions
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -66,3 +69,18 @@ class BackgroundMapper:
         while self._ahead and (len(self._ahead) > most or self._ahead[0].done()):
             self._ahead[0].result()
             self._ahead.popleft()
+
+
+def mapper_of(camera: Camera, options: OdometryOptions) -> BackgroundMapper | None:
+    """Return the mapper of a run with loops, which allows for shutter and depth delay if the odometry does; else None.
+
+    Args:
+        camera: Camera of the frames, without distortion.
+        options: The run's.
+
+    Raises:
+        GavoError: GTSAM is not installed.
+    """
+    if not options.loops:
+        return None
+    return BackgroundMapper(Mapper(as_exposed(camera, options), synchronise=options.synchronise))

@@ -76,7 +76,7 @@ def find_candidates(new: Keyframe, others: list[Keyframe], camera: Camera) -> li
 
 def _most_overlapping(new: Keyframe, others: list[Keyframe], camera: Camera) -> list[Keyframe]:
     """Earlier keyframes that were not tried yet and see most of what the new one sees."""
-    old = [o for o in others if new.timestamp - o.timestamp >= MIN_SECONDS and not _was_tried(new, o)]
+    old = [o for o in others if abs(new.timestamp - o.timestamp) >= MIN_SECONDS and not _was_tried(new, o)]
     points = new.thumbnail.points[:, :: max(1, new.thumbnail.points.shape[1] // FEW_POINTS)]
     if not old or not points.size:
         return []

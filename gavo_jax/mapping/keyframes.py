@@ -164,10 +164,11 @@ class Keyframes:
     Args:
         camera: Camera of the frames as they come, without distortion.
         most: Largest number of keyframes that keep their images; at least 2.
+        synchronise: Whether depth is moved to when the colour image was taken.
     """
 
-    def __init__(self, camera: Camera, most: int = MAX_IMAGES):
-        self.full, self.camera, self.most = camera, camera.level(1), max(most, 2)
+    def __init__(self, camera: Camera, most: int = MAX_IMAGES, synchronise: bool = True):
+        self.full, self.camera, self.most, self.synchronise = camera, camera.level(1), max(most, 2), synchronise
         self.all: list[Keyframe] = []
 
     def is_due(self, world_T_camera: Float64[np.ndarray, "4 4"], segment: int) -> bool:
@@ -196,7 +197,7 @@ class Keyframes:
             twist: Motion of the points in the camera at its moment, m/s and rad/s.
             step: Covariance of the odometry's motion from the last keyframe; None: unknown.
         """
-        delay = frame.depth_delay
+        delay = frame.depth_delay if self.synchronise else 0.0
         images = compensate_motion(frame.grey, frame.depth, self.full, twist, delay)
         return Keyframe(
             number=len(self.all),

@@ -65,14 +65,15 @@ class Mapper:
     Args:
         camera: Camera of the frames, without distortion.
         most: Maximum number of keyframes that keep their images.
+        synchronise: Whether keyframes' depth is moved to when their colour image was taken.
 
     Raises:
         GavoError: GTSAM is not installed.
     """
 
-    def __init__(self, camera: Camera, most: int = MAX_IMAGES):
+    def __init__(self, camera: Camera, most: int = MAX_IMAGES, synchronise: bool = True):
         require_gtsam()
-        self.keyframes = Keyframes(camera, most)
+        self.keyframes = Keyframes(camera, most, synchronise)
         self.verifier = Verifier(self.keyframes.camera)
         self.recogniser = Recogniser(self.keyframes.camera, self.verifier)
         self.edges: list[Edge] = []
@@ -222,7 +223,8 @@ class Mapper:
             while step is not None:
                 keyframe.in_doubt |= is_in_doubt(step)
                 before = stamp_name(step.reference_timestamp)
-                step = None if before in stamps else tracked.get(before)
+                earlier = None if before in stamps else tracked.get(before)
+                step = earlier if earlier and earlier.index < step.index else None  # stamps may repeat
 
     def _follow(self, step: Step) -> None:
         """Accumulate the covariance of the motion since the last keyframe."""

@@ -187,7 +187,7 @@ class Search:
             return attempt
         motion, seconds = np.asarray(result.target_T_reference), float(clock.elapsed)
         images = frame.grey, frame.depth, self.camera
-        is_known = bool(np.any(np.asarray(state.motion)))
+        is_known = is_motion_known(state)
         if is_known:
             is_open = another_period_fits_expected(motion, result.error, self.predict(state, seconds), *images)
         else:
@@ -220,6 +220,11 @@ def at_rest(state: TrackerState) -> TrackerState:
     """A state in which nothing is known of the camera's motion, as after a first frame."""
     still = jnp.zeros(6)
     return state._replace(motion=still, guess=still, instant_motion=still, seconds=jnp.float32(UNKNOWN_SECONDS))
+
+
+def is_motion_known(state: TrackerState) -> bool:
+    """Whether a state knows how the camera moves: not after a first frame, or a motion that may be off by a period."""
+    return bool(np.any(np.asarray(state.motion)))
 
 
 def _by_level(populations: Population | None) -> tuple[Population, ...]:

@@ -113,6 +113,8 @@ POOR = frozenset({AlignmentStatus.PARTIAL_DEPTH, AlignmentStatus.HIGH_ERROR})
 """Statuses of frames that have a motion, but become the reference only when the old one is out of reach."""
 DEPTHLESS = frozenset({AlignmentStatus.NO_DEPTH, AlignmentStatus.FROZEN})
 """Statuses of frames that have a motion, but never become the reference."""
+UNFIT_FOR_WAY = {AlignmentStatus.HIGH_ERROR, AlignmentStatus.AMBIGUOUS}
+"""Statuses of motions that tell nothing of the next one: their poses are rough, or may be off by a period."""
 DOUBTED_DEPTH = DEPTHLESS | {AlignmentStatus.DEPTH_MISMATCH}
 """Statuses of frames that have a motion, but no trustworthy depth of their own."""
 SOUGHT_AT_ONCE, SOUGHT_EVERY = 10, 10
@@ -306,7 +308,7 @@ class Odometry:
         after, result, lost = self._advance(before, frame, finding, attempt)
         after = after._replace(leap=leap if after.held else None, arrival=kept if after.held else renewed)
         size = (self.camera.height, self.camera.width)
-        since = None if lost else before.world_T_reference
+        since = None if lost or not attempt.is_found else before.world_T_reference
         bodies = tuple(in_world(seen, after.world_T_camera, since, size) for seen in attempt.bodies)
         revises = attempt.revises
         if not lost:
@@ -378,7 +380,7 @@ class Odometry:
                 held=0,
                 way=Way(),
             )
-        elif not attempt.unknown and AlignmentStatus.HIGH_ERROR not in result.statuses:  # else the pose is rough
+        elif not attempt.unknown and UNFIT_FOR_WAY.isdisjoint(result.statuses):
             since = frame.timestamp - before.reference_timestamp
             after = after._replace(way=before.way.after(since, np.asarray(result.xi, np.float64)))
         return after, result, False

@@ -13,9 +13,9 @@ from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import RUN, Sequence, require_parts, require_sequence
 from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.errors import GavoError
-from gavo_jax.mapping.background import BackgroundMapper
+from gavo_jax.mapping.background import BackgroundMapper, mapper_of
 from gavo_jax.mapping.correction import Doubts, correct, loop_figures
-from gavo_jax.mapping.mapper import Loops, Mapper
+from gavo_jax.mapping.mapper import Loops
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.metrics import RunMetrics, compute_metrics, errors_before, run_identity
@@ -104,7 +104,7 @@ def run_odometry(
     sequence = without_distortion(sequence)
     settings = as_settings(settings, solver, alignment=alignment, odometry=options)
     seed = as_seed(seed)
-    mapper = BackgroundMapper(Mapper(sequence.camera)) if settings.odometry.loops else None
+    mapper = mapper_of(sequence.camera, settings.odometry)
     odometry = Odometry(sequence.camera, settings, seed=seed, relocaliser=mapper)
     compile_seconds = odometry.warm_up() + (mapper.warm_up() if mapper else 0.0)
     steps: list[Step] = []

@@ -250,7 +250,7 @@ class RunFolder:
         if not path.exists() or (self.path / CHECKPOINT).exists():
             return None
         metrics = read_json_object(path)
-        if metrics.get(IMAGES, unchanged := self._seen.all()) != unchanged:
+        if metrics.get(IMAGES, unchanged := self._seen.up_to(metrics.get("pairs", 0))) != unchanged:
             raise GavoError(_other_images(path))
         self._revise()  # it may have been killed before that
         return metrics

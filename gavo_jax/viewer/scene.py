@@ -132,7 +132,8 @@ class Scene:
 
     def add_loops(self, trajectory: Trajectory, loops: Loops) -> None:
         """Collect the corrected trajectory, and the loops with their residuals."""
-        self._add("world/corrected", strips=trajectory.world_T_camera[None, :, :3, 3])
+        paths = np.split(trajectory.world_T_camera[:, :3, 3], np.flatnonzero(np.diff(trajectory.segments)) + 1)
+        self._add("world/corrected", sizes=[len(paths)], strips=paths)
         if not loops.edges:
             return
         places = [keyframe.world_T_camera[:3, 3] for keyframe in loops.keyframes]

@@ -207,7 +207,7 @@ def test_the_last_motion_does_not_stand_in_for_frames_that_were_lost(
     monkeypatch.setattr(BodyAware, "_share_out", lambda *_: missing)
     monkeypatch.setattr(BodyAware, "_helped_by_prediction", lambda *_: guess)
     scene = SimpleNamespace(seconds_extrapolated=0.0, tracks=SimpleNamespace(labels=np.ones((6, 8))))
-    state: Any = SimpleNamespace(tracker=SimpleNamespace(seconds=1 / 30), scene=scene)
+    state: Any = SimpleNamespace(tracker=SimpleNamespace(seconds=1 / 30, motion=np.ones(6)), scene=scene)
     nothing: Any = None
     clock: Any = SimpleNamespace(elapsed=(lost + 1) / 30)
     attempt, _ = BodyAware(nothing, nothing)._asked(state, nothing, clock, missing)

@@ -46,5 +46,7 @@ def test_a_suspicion_fades_ends_where_all_is_at_rest_and_is_not_learnt_from_a_wr
     after = suspect(belief, body, 1 / 30, trusted=True)
     assert np.all(after[body] == 1) and not np.any(after[field(OTHER) > 0]) and 0.9 < after[0, 0] < 1
     assert suspect(belief, body, 0.2, trusted=True)[0, 0] == pytest.approx(after[0, 0] ** 6, rel=1e-5), "by the clock"
+    kept = suspect(belief, body, 1 / 30, trusted=False)
+    np.testing.assert_array_equal(kept, 1.0, "one that stopped seems to be at rest under a motion that follows it")
     nobody = belief._replace(suspected=np.zeros((60, 80)))  # pyright: ignore
     assert not np.any(suspect(nobody, body, 1 / 30, trusted=False))

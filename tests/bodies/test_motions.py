@@ -38,6 +38,7 @@ def test_a_motion_in_the_camera_is_one_in_the_world() -> None:
     assert body.displacement == pytest.approx([0, 0.05, 0]) and body.rotation == pytest.approx(np.zeros(3))
     assert body.centroid == pytest.approx([1, 2, 5])
     assert body.mask.shape == (120, 160) and body.mask[40, 40] and not body.mask[100, 100]
+    assert "mask" not in vars(body), "the masks of a run would fill the memory"
     still = in_world(seen._replace(alignment=None), turned, turned, (120, 160))
     of_lost = in_world(seen, turned, None, (120, 160))
     assert np.isnan([of_lost.displacement, of_lost.rotation]).all(), "the camera's own part is not known"
@@ -66,6 +67,25 @@ def test_a_bodys_motion_is_its_own_under_a_rolling_shutter() -> None:
     assert np.median(apart) < 0.002 and np.median(turned) < np.radians(0.3)
 
 
+CLOCK = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
+PART = np.zeros((120, 160), bool)
+PART[10:30, 10:30] = True
+
+
+def found_again(before: BodyTracks) -> tuple[BodyTracks, Seen]:
+    """Tracks and sight of a body that was at the same place in an earlier frame."""
+    search = Search(CAMERA, TRACKED, jax.random.key(0))
+    aware = BodyAware(search, search)
+    blank = aware.blank_state()
+    assert aware.segmenter.size == PART.shape
+    state = blank._replace(scene=blank.scene._replace(tracks=before))
+    belief: Any = SimpleNamespace(moving=PART.astype(np.float32))
+    frame: Any = None
+    parts, nearness = PART.astype(np.int32), np.ones(PART.shape)
+    tracks, seen = motions.find_motions(search, aware.segmenter, state, frame, CLOCK, parts, belief, nearness)
+    return tracks, seen[0]
+
+
 @pytest.mark.parametrize("status", [AlignmentStatus.OK, AlignmentStatus.LOW_TEXTURE])
 def test_what_a_bodys_images_do_not_tell_is_not_its_last_motion(
     status: AlignmentStatus, monkeypatch: pytest.MonkeyPatch
@@ -74,24 +94,21 @@ def test_what_a_bodys_images_do_not_tell_is_not_its_last_motion(
     xi = np.full(6, 0.01, np.float32)
     found = no_alignment(status)._replace(xi=xi)
     monkeypatch.setattr(motions, "_align", lambda *_: found)
-    search = Search(CAMERA, TRACKED, jax.random.key(0))
-    aware = BodyAware(search, search)
-    blank = aware.blank_state()
-    part = np.zeros(aware.segmenter.size, bool)
-    part[10:30, 10:30] = True
-    before = associate(part.astype(np.int32), BodyTracks.empty(part.shape))
-    state = blank._replace(scene=blank.scene._replace(tracks=before))
-    belief: Any = SimpleNamespace(moving=part.astype(np.float32))
-    frame: Any = None
-    clock = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
-    nearness = np.ones(part.shape)
-    found_parts = part.astype(np.int32)
-    tracks, seen = motions.find_motions(search, aware.segmenter, state, frame, clock, found_parts, belief, nearness)
-    assert seen[0].alignment is found
-    place = list(tracks.numbers).index(seen[0].number)
+    tracks, seen = found_again(associate(PART.astype(np.int32), BodyTracks.empty(PART.shape)))
+    assert seen.alignment is found
+    place = list(tracks.numbers).index(seen.number)
     is_known = status is AlignmentStatus.OK
     np.testing.assert_array_equal(tracks.motions[place], xi if is_known else np.zeros(6))
-    assert tracks.seconds[place] == (clock.elapsed if is_known else UNKNOWN_SECONDS)
+    assert tracks.seconds[place] == (CLOCK.elapsed if is_known else UNKNOWN_SECONDS)
+
+
+def test_a_body_that_was_hidden_in_the_last_frame_has_no_motion_since(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It got that of what stood before it: its own old place was searched in the last frame."""
+    monkeypatch.setattr(motions, "_align", lambda *_: no_alignment(AlignmentStatus.OK))
+    shown = associate(PART.astype(np.int32), BodyTracks.empty(PART.shape))
+    hidden = associate(np.zeros(PART.shape, np.int32), shown)
+    _, seen = found_again(hidden)
+    assert seen.number == shown.numbers[0] and seen.alignment is None
 
 
 def test_a_body_whose_motion_was_once_in_doubt_is_known_again() -> None:

@@ -22,7 +22,7 @@ def test_the_oldest_view_is_of_about_a_quarter_of_a_second_ago_at_any_frame_rate
     scene, kept = segmenter.first(tracker), []
     for _ in range(frames):
         before = scene.age
-        look = segmenter.look(scene, tracker, np.eye(4))
+        look = segmenter.look(scene, tracker, np.eye(4), 1 / rate)
         scene = segmenter.renewed(scene, look, 1 / rate)
         kept.append(float(scene.age) > float(before))
     assert kept == [True] * (frames - 1) + [False]
@@ -34,12 +34,12 @@ def test_an_older_view_that_sees_little_of_the_image_goes_at_once(in_view: float
     odometry.register(Carded()[0], 0.0)
     state, segmenter = odometry.progress.tracker.first, MotionSegmenter(CAMERA, TRACKED)
     state = state._replace(tracker=state.tracker._replace(seconds=np.float32(1 / 30)))
-    look = segmenter.look(state.scene, state.tracker, np.eye(4))
+    look = segmenter.look(state.scene, state.tracker, np.eye(4), 1 / 30)
     belief = look.belief._replace(in_view=jnp.array([1.0, in_view]))
     scene = segmenter.renewed(state.scene, look._replace(belief=belief), 1 / 30)
     older, between = scene.views_T_last[1], jnp.eye(4).at[0, 3].set(0.1)
     scene = scene._replace(views_T_last=scene.views_T_last.at[2].set(between))
-    after = segmenter.renewed(scene, segmenter.look(scene, state.tracker, np.eye(4)), 1 / 30)
+    after = segmenter.renewed(scene, segmenter.look(scene, state.tracker, np.eye(4), 1 / 30), 1 / 30)
     np.testing.assert_allclose(after.views_T_last[1], between if goes else older, atol=1e-6)
 
 

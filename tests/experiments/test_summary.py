@@ -41,6 +41,20 @@ def test_a_method_that_got_lost_does_not_speak_for_the_sequence():
     assert alone.startswith("No drift of desk: no two frames")
 
 
+def test_a_run_that_got_lost_is_worse_than_any_that_did_not() -> None:
+    """A method that lost the camera in five of six runs was the best of all: only the sixth counted, for all six."""
+    table = rows("a", "x", [0.01, None, None, None, None, None])
+    table += rows("a", "y", [0.02, 0.021, 0.022, 0.023, 0.024, 0.025])
+    first, second = summarise(table)
+    assert (first.runs, first.known, first.rotation) == (6, 1, np.inf) and first.drift == (np.inf, np.inf, np.inf)
+    assert second.drift == pytest.approx((0.02125, 0.0225, 0.02375))
+    (note,) = _without_drift([first, second])
+    assert note.startswith("No drift of a by x in 5 of 6 runs, which count as infinite")
+    (found,) = compare(table)
+    assert found.pairs == 6 and found.ratio == np.inf and found.p == pytest.approx(0.0625)
+    assert compare(rows("b", "x", [None, None]) + rows("b", "y", [None, None])) == []
+
+
 def test_a_clear_difference_is_significant_and_none_is_not():
     better = np.linspace(0.01, 0.02, 12)
     worse = better * np.linspace(1.1, 1.3, 12)

@@ -1,7 +1,7 @@
 """The driver: poses chained, images of any kind taken, lost frames survived, references that are fit."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import small
 from driving import CAMERA, FRAMES, PLAIN, SEARCH_ALONE, SOLVER, Altered, Told, errors, found, run, unreadable
-from small import Rendered
+from small import Rendered, StandIn
 
+from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.pairs import align
-from gavo_jax.alignment.result import with_finding
+from gavo_jax.alignment.result import Alignment, with_finding
+from gavo_jax.bodies.records import Seen
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.rendered.sensor_noise import NONE
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
@@ -342,6 +344,40 @@ def test_a_frame_without_depth_is_no_reference_however_long_the_old_one_is_held(
     for index, frame in enumerate(Rendered(frames=6, camera=CAMERA, noise=NONE)):
         odometry.register(frame, index / 30)
     assert (odometry.progress.held < 5) == (use is AlignmentStatus.PARTIAL_DEPTH)
+
+
+@pytest.mark.parametrize(
+    ("status", "tells"),
+    [(AlignmentStatus.PARTIAL_DEPTH, True), (AlignmentStatus.AMBIGUOUS, False), (AlignmentStatus.HIGH_ERROR, False)],
+)
+def test_the_next_motion_is_not_expected_by_one_that_may_be_off(status: AlignmentStatus, tells: bool) -> None:
+    """Before tiles a motion that may be off by one of them was the prediction of the next, which then was `ok`."""
+    odometry = Odometry(CAMERA, aligner=Told(found(status, 0.01), confirmed=True))
+    for index, frame in enumerate(Rendered(frames=2, camera=CAMERA, noise=NONE)):
+        odometry.register(frame, index / 30)
+    assert bool(odometry.progress.way.fixes) == tells
+
+
+@dataclass
+class Showing(StandIn):
+    """An aligner that always finds one motion, and a body that moves in the image."""
+
+    result: Alignment
+
+    def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+        body = Seen(1, np.ones((6, 8), np.float32), 0.1, np.array([0.0, 0.0, 2.0]), found(AlignmentStatus.OK, 0.05))
+        return Attempt(frame.timestamp, self.result, True, bodies=(body,))
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_how_far_a_body_moved_is_unknown_where_the_camera_s_motion_is(is_known: bool) -> None:
+    """Bodies leapt by what the camera's pose was corrected by, and were `ok`."""
+    covariance = 1e-6 * np.eye(6, dtype=np.float32) if is_known else UNKNOWN
+    odometry = Odometry(CAMERA, aligner=Showing(found(AlignmentStatus.OK, 0.01)._replace(covariance=covariance)))
+    first, second = Rendered(frames=2, camera=CAMERA, noise=NONE)
+    odometry.register(first, 0.0)
+    step = odometry.register(second, 1 / 30)
+    assert step is not None and np.isfinite(step.bodies[0].displacement).all() == is_known
 
 
 def test_the_stamp_that_is_registered_is_the_frame_s() -> None:
