@@ -178,6 +178,22 @@ def test_a_live_map_begins_with_the_first_frame_that_is_of_use(begins):
     assert left_out == ([f"{begins} frame{'s' * (begins > 1)}: lost"] if begins else [])
 
 
+@pytest.mark.parametrize(("second", "begins"), [(AlignmentStatus.BLANK, 2), (AlignmentStatus.HIGH_ERROR, 0)])
+def test_a_live_map_waits_for_a_frame_that_fits_its_first_one(second, begins):
+    """The first of several dark frames was fused as the map's origin, and the frame that the poses are of was not."""
+    scene: Any = LiveMap(Fused())  # pyright: ignore[reportArgumentType]
+    scene.watch(WALK[0], None)
+    scene.watch(WALK[1], stepped(1, second, lost=True))
+    if begins:
+        scene.watch(WALK[2], stepped(2, AlignmentStatus.NO_REFERENCE, lost=True))
+    else:
+        scene.watch(WALK[2], stepped(2))
+    scene.watch(WALK[3], stepped(3))
+    frames, _, left_out = scene.finish("cloud")
+    assert frames == [WALK.timestamps[i] for i in (0, 2, 3) if i >= begins]
+    assert left_out == [f"{1 + (begins > 0)} frame{'s' * (begins > 0)}: lost"]
+
+
 @pytest.mark.parametrize("name", ["a.ply", "a.pcd", "a.obj"])
 def test_an_empty_map_is_not_written(tmp_path, name):
     triangles = np.zeros((0, 3), int) if name == "a.obj" else None

@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from gavo_jax.errors import GavoError
 from gavo_jax.experiments.plan import Part, batches, frames_of, programs
 from gavo_jax.experiments.plan_file import read_plan
 from gavo_jax.experiments.runner import fitted_batches
+from gavo_jax.trajectory import Trajectory
 
 GRID = """
 [[methods]]
@@ -74,6 +76,30 @@ def test_other_images_or_another_truth_are_another_sequence():
     kinds = [frames_of("room", sequence) for sequence in (one, same, other)]
     assert kinds[0] == kinds[1] and kinds[0]["timestamps_sha256"] == kinds[2]["timestamps_sha256"]
     assert kinds[0]["images_sha256"] != kinds[2]["images_sha256"] and frames_of("hall", one) != kinds[0]
+
+
+class Clocked(SyntheticSequence):
+    """A room whose depth or truth is late, in seconds."""
+
+    depth_late, truth_late = 0.0, 0.0
+
+    def __getitem__(self, index: Any) -> Any:
+        frame = super().__getitem__(index)
+        return replace(frame, depth_timestamp=frame.timestamp + self.depth_late)
+
+    @property
+    def ground_truth(self) -> Trajectory:
+        truth = super().ground_truth
+        return Trajectory(truth.timestamps + self.truth_late, truth.world_T_camera)
+
+
+@pytest.mark.parametrize("clock", ["depth_late", "truth_late"])
+def test_other_clocks_are_another_sequence(clock: str) -> None:
+    """A corrected delay of depth, or clock of the truth, left "0 to do" and the old errors."""
+    room, late = Clocked(4, camera=CAMERA), Clocked(4, camera=CAMERA)
+    assert frames_of("room", room) == frames_of("room", late)
+    setattr(late, clock, 0.02)
+    assert frames_of("room", room) != frames_of("room", late)
 
 
 def test_a_camera_file_without_a_size_takes_the_images(write_experiment, tmp_path):

@@ -42,6 +42,16 @@ def test_a_row_comes_back(tmp_path):
     assert rows[0]["configuration"] == '{"a": [1, null]}' and rows[0]["git_modified"] is True
 
 
+def test_a_row_that_a_power_cut_left_empty_is_none(tmp_path):
+    """The run counted as done, and its table could not be read."""
+    table = Table(tmp_path)
+    table.append(row("a"))
+    (table.folder / "b.parquet").write_bytes(b"")
+    assert table.done() == {"a"} and [found["run"] for found in table.read()] == ["a"]
+    table.append(row("b"))
+    assert table.done() == {"a", "b"}
+
+
 def test_two_writers_lose_nothing_and_double_nothing(tmp_path):
     context = multiprocessing.get_context("spawn")
     start = context.Event()

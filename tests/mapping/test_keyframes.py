@@ -1,6 +1,7 @@
 """Keyframes: of one moment, bounded in number, found again; the driver that asks for them."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.rendered.sensor_noise import NONE
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.image.motion_compensation import compensate_motion
+from gavo_jax.mapping.background import mapper_of
 from gavo_jax.mapping.candidates import APART, MAX_CANDIDATES, MIN_SECONDS, LoopCandidate, find_candidates
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.keyframes import NOTHING_SEEN, Keyframe, Keyframes, shift, shifts
@@ -25,7 +27,7 @@ from gavo_jax.odometry.metrics import compute_metrics
 from gavo_jax.odometry.run import doubts_of, trajectory_of
 from gavo_jax.output.frames import FRAME_COLUMNS, frame_row
 from gavo_jax.rigid_motions import exp, length_and_angle, log
-from gavo_jax.settings import Settings
+from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory, inverse
 
@@ -138,6 +140,8 @@ def test_images_are_bounded_and_the_likest_are_candidates():
     found = find_candidates(keyframes.all[24], kept[:-1], keyframes.camera)
     assert found and all(c.likeness > 0.88 and c.overlap >= 0.5 for c in found)
     assert all(c.later.timestamp - c.earlier.timestamp >= MIN_SECONDS for c in found)
+    keyframes.all[24].timestamp -= 100.0
+    assert len(find_candidates(keyframes.all[24], kept[:-1], keyframes.camera)) >= len(found), "its clock was set back"
     numbers = sorted(c.earlier.number for c in found)
     assert all(b - a >= APART for a, b in zip(numbers, numbers[1:], strict=False))
 
@@ -230,6 +234,31 @@ def test_a_doubted_motion_ties_little():
     assert any(doubted) and not all(doubted)
     for edge, is_doubted in zip(mapper.odometry_edges(), doubted, strict=True):
         assert (np.diag(edge.covariance) >= 0.1**2).all() == is_doubted
+
+
+def test_ways_end_where_a_clock_that_was_set_back_repeats_its_stamps():
+    """The run hung at its end: a step's reference seemed to be a later one, and its reference the step."""
+    mapper, stamps = Mapper(CAMERA), [10.0, 10.1, 10.2, 10.1, 10.2, 12.0]
+    keyframes: Any = [SimpleNamespace(timestamp=stamp, in_doubt=False) for stamp in (10.0, 12.0)]
+    mapper.keyframes.all = keyframes
+    found = no_alignment(AlignmentStatus.OK)
+    mapper._doubt([Step(i, stamps[i - 1], stamps[i], found, np.eye(4), 0.0, False) for i in range(1, 6)])
+    assert not any(keyframe.in_doubt for keyframe in keyframes)
+
+
+def test_what_is_not_synchronised_is_not_in_the_map_either():
+    """Loops reckoned with a shutter and a depth delay that a run's settings leave out."""
+    late = replace(WALK[6], depth_timestamp=WALK[6].timestamp + 0.02)
+    twist = np.array([0.3, 0.0, 0.0, 0.0, 0.5, 0.0])
+    rolling = replace(CAMERA, readout=0.03)
+    options = OdometryOptions(loops=True, rolling_shutter=False, synchronise=False)
+    mapper = mapper_of(rolling, options)
+    assert mapper is not None and mapper_of(rolling, replace(options, loops=False)) is None
+    made = mapper.mapper.keyframes.make(late, 6, 0, np.eye(4), twist)
+    plain = Keyframes(CAMERA).make(WALK[6], 6, 0, np.eye(4), twist)
+    assert made.images is not None and plain.images is not None
+    np.testing.assert_array_equal(made.images.grey, plain.images.grey)
+    np.testing.assert_array_equal(made.images.depth, plain.images.depth)
 
 
 def test_what_may_be_the_last_keyframe_is_read_again_where_a_run_goes_on():

@@ -341,6 +341,15 @@ def test_images_that_changed_are_noticed(clip, tmp_path, monkeypatch, capsys, un
     assert error.count("\n") == 1 and "the images differ from those" in error
 
 
+def test_a_run_that_ended_at_a_lost_pair_says_so(clip, tmp_path, capsys, undrawn):
+    """It was told that the images had changed: those of all frames were compared with those that it had seen."""
+    assert main(arguments(clip, tmp_path / "out", "--on-lost", "stop")) == 0
+    assert not json.loads((tmp_path / "out" / "metrics.json").read_text())["complete"]
+    capsys.readouterr()
+    assert main(arguments(clip, tmp_path / "out", "--on-lost", "stop", "--resume")) == 0
+    assert "the run ended at its first lost pair: nothing to resume" in capsys.readouterr().err
+
+
 def test_a_finished_run_that_nothing_tells_of_is_not_shown_for_another(whole, clip, tmp_path, capsys):
     shutil.copytree(whole, tmp_path / "out")
     (tmp_path / "out" / "config.json").unlink()

@@ -182,12 +182,13 @@ def test_loops_and_the_corrected_path_are_shown_in_the_end(run, tmp_path):
     with shown:
         shown.open("loops", sequence.camera, sequence.timestamps, None)
         shown.watch(sequence[0], None)
-        shown.show_corrected(Trajectory(sequence.timestamps[1:], poses), loops)
+        shown.show_corrected(Trajectory(sequence.timestamps[1:], poses, np.array([0, 0, 1])), loops)
     found = read_recording(tmp_path / "loops.rrd")
     [row] = found["/world/loops"]
     assert component(row, "labels") == ["3 mm left", "400 mm left"]
     assert len(set(component(row, "colors"))) == 2
-    assert np.allclose(component(found["/world/corrected"][0], "strips")[0], poses[:, :3, 3], atol=1e-6)
+    first, second = component(found["/world/corrected"][0], "strips")
+    assert np.allclose([*first, *second], poses[:, :3, 3], atol=1e-6) and len(second) == 1, "no line where none was seen"
 
 
 @pytest.mark.parametrize("half", [3.0, 40.0, 500.0])
