@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -55,11 +56,18 @@ LARGEST = 1e10
 """Largest value in a file of poses, including seconds since 1970."""
 
 Seconds = Callable[[np.ndarray], np.ndarray]
-"""Maps frame numbers to times, seconds."""
+"""Maps frame numbers to times, seconds; NaN where a time is unknown."""
+
+
+class Counted(NamedTuple):
+    """Frames that are numbered instead of stamped."""
+
+    numbers: Sequence[float]
+    seconds: Seconds
 
 
 def truth_in(
-    folder: Path, frames: Iterable[float], seconds: Seconds | None, depth: Mapping[int, float] | None = None
+    folder: Path, frames: Iterable[float], counted: Counted | None, depth: Mapping[int, float] | None = None
 ) -> Trajectory | None:
     """Read the ground truth in a folder; None if there is none.
 
@@ -67,9 +75,10 @@ def truth_in(
         folder: folder of the frames.
         frames: their stamps, seconds. Of the possible units of the truth's stamps, the one that overlaps these best is
             chosen.
-        seconds: maps frame numbers to times, where frames have no stamps. A truth whose stamps are whole numbers may
-            then count frames; that is preferred unless they look like stamps since 1970.
-        depth: time of each depth image by its number, if a truth may be in Redwood's format.
+        counted: their numbers, where they have no stamps of their own. A truth whose stamps are whole numbers may then
+            count frames; that is preferred unless they look like stamps since 1970. A pose whose number has no time is
+            left out.
+        depth: time of each depth image by its number, if a truth may be in Redwood's format; see `read_log`.
 
     Raises:
         GavoError: it cannot be read.
@@ -79,31 +88,39 @@ def truth_in(
             truth = Trajectory.read_tum(folder / TRUTH)
         except GavoError as error:
             raise GavoError(f"{error}; rename it to have it ignored") from None
-        return _timed(truth, folder / TRUTH, list(frames), seconds)
+        return _timed(truth, folder / TRUTH, list(frames), counted)
     if (file := icl_truth(folder)) is not None:
-        return _read_icl(file, seconds)
+        return _read_icl(file, counted)
     return read_log(folder / LOG, depth) if depth and (folder / LOG).exists() else None
 
 
-def _timed(truth: Trajectory, place: Path, frames: list[float], seconds: Seconds | None) -> Trajectory:
+def _timed(truth: Trajectory, place: Path, frames: list[float], counted: Counted | None) -> Trajectory:
     """Convert the stamps of a ground truth to seconds."""
     stamps = truth.timestamps
     known = clock_unit(stamps.tolist())
     readings = [np.array(in_seconds(stamps.tolist(), counted_in(truth)))]
-    if _are_whole(truth) and seconds:
-        readings.insert(1 if known else 0, seconds(stamps + _behind(stamps, place, frames, seconds)))
+    if _are_whole(truth) and counted:
+        of_frames = counted.seconds(stamps + _behind(stamps, place, np.array(counted.numbers)))
+        readings[1 if known else 0 : 0] = [of_frames] if np.isfinite(of_frames).any() else []
     if not known:
         readings += [unit * stamps for unit in (*UNITS[1:], TICK)]
     low, high = min(frames), max(frames)
 
     def met(reading: np.ndarray) -> float:
         """Share of the frames' time span that the stamps overlap, rounded to a tenth."""
-        return round(float(min(high, reading.max()) - max(low, reading.min())) / max(high - low, MILLISECOND), 1)
+        return round(
+            float(min(high, np.nanmax(reading)) - max(low, np.nanmin(reading))) / max(high - low, MILLISECOND), 1
+        )
 
-    return replace(truth, timestamps=max(readings, key=lambda reading: max(met(reading), 0.0)))
+    return _with_times(truth, max(readings, key=lambda reading: max(met(reading), 0.0)))
 
 
-def _behind(numbers: np.ndarray, place: Path, frames: list[float], seconds: Seconds) -> int:
+def _with_times(truth: Trajectory, times: Float[np.ndarray, " n"]) -> Trajectory:
+    """The poses whose times are known, at these times."""
+    return replace(truth, timestamps=times)[np.isfinite(times)]
+
+
+def _behind(numbers: np.ndarray, place: Path, images: np.ndarray) -> int:
     """Return the offset from a truth's frame numbers to those of the images.
 
     Where there are as many poses as images, both without gaps, they pair in order.
@@ -111,8 +128,7 @@ def _behind(numbers: np.ndarray, place: Path, frames: list[float], seconds: Seco
     Raises:
         GavoError: one counts from 0 and the other from 1, and the ends differ too: the pairing is ambiguous.
     """
-    images = _numbers(frames, seconds)
-    if images is None or not (_is_without_gap(numbers) and _is_without_gap(images)):
+    if not (_is_without_gap(numbers) and _is_without_gap(images)):
         return 0
     (a, b), (c, d) = ((round(min(some)), round(max(some))) for some in (images, numbers))
     if len(images) == len(numbers):
@@ -122,18 +138,6 @@ def _behind(numbers: np.ndarray, place: Path, frames: list[float], seconds: Seco
             f"{place}: poses are numbered {c} to {d}, images {a} to {b}: give the poses the numbers of their images"
         )
     return 0
-
-
-def _numbers(frames: list[float], seconds: Seconds) -> np.ndarray | None:
-    """The frame numbers at these times; None where `seconds` is not evenly spaced."""
-    stamps = np.sort(frames)
-    try:
-        start, second = seconds(np.array([0.0, 1.0]))
-        numbers = np.round((stamps - start) / (second - start))
-        is_even = np.allclose(seconds(numbers), stamps, rtol=0, atol=(second - start) / 10)
-    except GavoError:  # beyond the end of the clock
-        return None
-    return numbers if is_even else None
 
 
 def _is_without_gap(numbers: np.ndarray) -> bool:
@@ -195,18 +199,25 @@ def icl_truth(folder: Path) -> Path | None:
     return files[0] if files else None
 
 
-def _read_icl(path: Path, seconds: Seconds | None) -> Trajectory:
+def _read_icl(path: Path, counted: Counted | None) -> Trajectory:
     truth = Trajectory.read_tum(path)
     if not _are_whole(truth):
         raise GavoError(
             f"{path}: expected frame numbers in the first column: rename it to {TRUTH} if they are timestamps"
         )
-    if seconds is None:
+    if counted is None:
         raise GavoError(
             f"{path}: its poses have frame numbers, but the images have timestamps: give the poses timestamps, in a "
             f"file named {TRUTH}"
         )
-    return replace(truth, timestamps=seconds(truth.timestamps), world_T_camera=MIRROR @ truth.world_T_camera @ MIRROR)
+    mirrored = replace(truth, world_T_camera=MIRROR @ truth.world_T_camera @ MIRROR)
+    times = counted.seconds(truth.timestamps)
+    if not np.isfinite(times).any():
+        low, high = truth.timestamps[[0, -1]]
+        raise GavoError(
+            f"{path}: none of its frames ({low:.0f} to {high:.0f}) has an image: give the poses their numbers"
+        )
+    return _with_times(mirrored, times)
 
 
 def _are_whole(truth: Trajectory) -> bool:
@@ -221,7 +232,7 @@ def read_log(path: Path, times: Mapping[int, float]) -> Trajectory | None:
 
     Args:
         path: the file.
-        times: times of depth images by their numbers, seconds.
+        times: times of depth images by their numbers, seconds; NaN where unknown.
 
     Returns:
         The finite poses; None if there are none.
@@ -241,7 +252,7 @@ def read_log(path: Path, times: Mapping[int, float]) -> Trajectory | None:
         if len(blocks) != len(numbers):
             raise GavoError(f"{path}: none of its frames ({min(blocks)} to {max(blocks)}) has an image")
         named = {ours: times[n] for ours, n in zip(sorted(blocks), numbers, strict=True)}
-    known = [frame for frame in sorted(poses) if frame in named]
+    known = [frame for frame in sorted(poses) if np.isfinite(named.get(frame, np.nan))]
     if not known:
         return None
     stamps = np.array([named[frame] for frame in known])

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from gavo_jax.camera import preset_for_sequence
 from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.own_camera import own_camera_file
-from gavo_jax.datasets.truth import Seconds
+from gavo_jax.datasets.truth import Counted
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory
 
@@ -36,9 +36,9 @@ class Bonn(TumSequence):
         return is_bonn and super().recognises(path) and own_camera_file(path) is None
 
     @classmethod
-    def truth(cls, folder: Path, stamps: list[float], seconds: Seconds | None) -> tuple[Trajectory | None, list[str]]:
+    def truth(cls, folder: Path, stamps: list[float], counted: Counted | None) -> tuple[Trajectory | None, list[str]]:
         """The markers' true poses, converted to the camera."""
-        found, unread = super().truth(folder, stamps, seconds)
+        found, unread = super().truth(folder, stamps, counted)
         if found is None:
             return found, unread
         return replace(found, world_T_camera=found.world_T_camera @ markers_T_camera()), unread

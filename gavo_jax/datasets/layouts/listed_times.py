@@ -25,8 +25,8 @@ def listed_times(path: Path, color: Sequence[Path], depth: Sequence[Path]) -> tu
     those of all colour images in order. Times have any form that `names.stamps` reads, or are decimal numbers.
 
     Returns:
-        A mapping from frame numbers to seconds, None if no list is read; and a line for a list that is not, with the
-        reason.
+        A mapping from frame numbers to seconds, NaN before the first and after the last; None if no list is read. And a
+        line for a list that is not, with the reason.
     """
     folders = dict.fromkeys((path, *(image.parent for image in color[:1])))
     file = next((folder / name for folder in folders for name in LISTS if (folder / name).is_file()), None)
@@ -42,7 +42,7 @@ def listed_times(path: Path, color: Sequence[Path], depth: Sequence[Path]) -> tu
         why = str(fault).removeprefix(f"{file}: ")
         return None, [f"{file.name}: times are not read from it ({why}): name the images by them, or pass --rate"]
     numbers, seconds = list(times), list(times.values())
-    return lambda wanted: np.interp(wanted, numbers, seconds), []
+    return lambda wanted: np.interp(wanted, numbers, seconds, np.nan, np.nan), []
 
 
 def _times_of(images: dict[int, Path], rows: list[tuple[str, list[str]]]) -> dict[int, float]:

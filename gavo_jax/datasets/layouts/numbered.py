@@ -23,7 +23,7 @@ from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from gavo_jax.datasets.layouts.image_folders import plain_files
 from gavo_jax.datasets.names import Found, by_number, images_among
 from gavo_jax.datasets.own_camera import own_camera_file
-from gavo_jax.datasets.truth import TRUTH, in_order, pose_files, pose_in, pose_of, truth_in
+from gavo_jax.datasets.truth import TRUTH, Counted, in_order, pose_files, pose_in, pose_of, truth_in
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory, inverse
 
@@ -115,7 +115,8 @@ class NumberedFolder(FileSequence):
         if cls.depth_is_of_view:
             calibration = calibration.with_depth_of_size(*depth_size_of_most(entries))
         if (path / TRUTH).exists():  # a custom ground truth overrides the dataset's poses
-            truth = truth_in(path, times.values(), None if is_stamped else lambda counts: counts / rate)
+            counted = None if is_stamped else Counted(numbers, lambda counts: counts / rate)
+            truth = truth_in(path, times.values(), counted)
         else:
             moved = calibration.color_T_depth if cls.poses_of_depth else None
             posed_T_color = np.eye(4) if moved is None else inverse(moved)

@@ -16,7 +16,7 @@ from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import Entry, Reading, size_of_most
 from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.own_camera import own_camera_file
-from gavo_jax.datasets.truth import TRUTH, Seconds, pose_of
+from gavo_jax.datasets.truth import TRUTH, Counted, pose_of
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.trajectory import Trajectory
 
@@ -60,9 +60,9 @@ class OpenLoris(TumSequence):
         return load_calibration(file, partial(size_of_most, entries), MILLIMETRES)
 
     @classmethod
-    def truth(cls, folder: Path, stamps: list[float], seconds: Seconds | None) -> tuple[Trajectory | None, list[str]]:
+    def truth(cls, folder: Path, stamps: list[float], counted: Counted | None) -> tuple[Trajectory | None, list[str]]:
         """The robot's true poses, converted to the colour camera if its pose on the robot is known."""
-        found, unread = super().truth(folder, stamps, seconds)
+        found, unread = super().truth(folder, stamps, counted)
         if found is None or not (folder / TRUTH).exists():
             return found, unread
         base_T_color = _base_T_color(folder / cls.TRANSFORMS)

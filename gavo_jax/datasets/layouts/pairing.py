@@ -9,7 +9,7 @@ import numpy as np
 from gavo_jax.datasets.clocks import MOST_STEPS, NAMES, clock_unit
 from gavo_jax.datasets.files import Entry, Reading
 from gavo_jax.datasets.names import by_number, mask_numbers, nameless, stamps, unpaired
-from gavo_jax.datasets.truth import Seconds
+from gavo_jax.datasets.truth import Counted, Seconds
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import associate
 
@@ -26,9 +26,9 @@ class Paired(NamedTuple):
     entries: list[Entry]
     left_out: list[str]
     times: dict[int, float]
-    """Stamp of each depth image, by the number in its name, else by its place, from 1."""
-    seconds: Seconds | None
-    """Maps frame numbers to times, where names are frame numbers."""
+    """Stamp of each depth image, by the number in its name, else by its place, from 1; NaN where unknown."""
+    counted: Counted | None
+    """The numbers of the frames and their times, where names are frame numbers."""
     guessed: str = ""
     """The unit guessed for names that are whole numbers without a date; empty if none was guessed."""
 
@@ -139,7 +139,7 @@ def paired_as_told(path: Path, color: list[Path], depth: list[Path], reading: Re
     """
     found = paired_by_stamp(path, color, color, reading) or paired_by_number(path, color, color, clock)
     partners = dict(zip(color, depth, strict=True))
-    told = stamps([file.stem for file in depth]) if found.seconds is None else None
+    told = stamps([file.stem for file in depth]) if found.counted is None else None
     of_depth = dict(zip(depth, told.seconds, strict=True)) if told else {}
     entries = []
     for stamp, image, *_ in found.entries:
@@ -167,4 +167,4 @@ def paired_by_number(path: Path, color: list[Path], depth: list[Path], clock: Se
         raise GavoError(f"{path}: no frames: {counts}, but no two with the same number{lone}")
     times = {n: float(clock(np.array(float(n)))) for n in {*numbers, *found.depth}}
     entries = [Entry(times[n], found.color[n], found.depth[n]) for n in numbers]
-    return Paired(entries, found.unpaired(len(numbers)), {n: times[n] for n in found.depth}, clock)
+    return Paired(entries, found.unpaired(len(numbers)), {n: times[n] for n in found.depth}, Counted(numbers, clock))

@@ -74,8 +74,8 @@ class PlainFolder(FileSequence):
         if cls.depth_is_of_view or (path / TRANSFORMS).is_file():
             calibration = calibration.with_depth_of_size(*depth_size_of_most(paired.entries))
         truth, unread = cls.truth(path, paired)
-        is_open = paired.seconds is not None and not reading.rate and told is None
-        unread += unread_truth(path, truth, cls.ESTIMATES) + (unread_times if paired.seconds else [])
+        is_open = paired.counted is not None and not reading.rate and told is None
+        unread += unread_truth(path, truth, cls.ESTIMATES) + (unread_times if paired.counted else [])
         sequence = cls(root.name, paired.entries, calibration, truth, reading, paired.left_out + others + unread)
         counted = NUMBERS if film is None else BY_FILM
         sequence.times_guessed = counted if is_open else paired.guessed
@@ -111,7 +111,7 @@ class PlainFolder(FileSequence):
         Raises:
             GavoError: it cannot be read.
         """
-        found = truth_in(path, [entry.stamp for entry in paired.entries], paired.seconds, paired.times)
+        found = truth_in(path, [entry.stamp for entry in paired.entries], paired.counted, paired.times)
         if found is not None or not (path / TRANSFORMS).is_file():
             return found, []
         return read_transforms(path / TRANSFORMS, {entry.color.stem: entry.stamp for entry in paired.entries})

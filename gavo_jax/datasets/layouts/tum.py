@@ -19,7 +19,7 @@ from gavo_jax.datasets.clocks import in_seconds
 from gavo_jax.datasets.files import Entry, FileSequence, Reading, resolve_folder, size_of_most
 from gavo_jax.datasets.names import decimal_unit, filled_in, unit_of, unpaired
 from gavo_jax.datasets.own_camera import own_camera_file, preset_or_export
-from gavo_jax.datasets.truth import Seconds, truth_in, unread_truth
+from gavo_jax.datasets.truth import Counted, truth_in, unread_truth
 from gavo_jax.errors import GavoError, as_path, data_rows, number, without_heading
 from gavo_jax.trajectory import Trajectory, associate
 
@@ -113,8 +113,9 @@ class TumSequence(FileSequence):
             raise GavoError(f"{self.folder}: no stamps of {names} within {max_difference:g} s of each other")
         files = [_files(entry, max_difference) for entry in entries]
         stamps = [entry.stamp for entry in files]
-        seconds = None if lists.unit == 1 else lambda counts: lists.unit * counts
-        truth, unread = self.truth(self.folder, stamps, seconds)
+        numbers = [float(entry.color.written) for entry in entries]
+        counted = None if lists.unit == 1 else Counted(numbers, lambda counts: lists.unit * counts)
+        truth, unread = self.truth(self.folder, stamps, counted)
         super().__init__(
             name or resolved.name,
             files,
@@ -149,13 +150,13 @@ class TumSequence(FileSequence):
         return preset_or_export(folder, load) if file is None else load(file)
 
     @classmethod
-    def truth(cls, folder: Path, stamps: list[float], seconds: Seconds | None) -> tuple[Trajectory | None, list[str]]:
+    def truth(cls, folder: Path, stamps: list[float], counted: Counted | None) -> tuple[Trajectory | None, list[str]]:
         """The ground truth in the folder, if any, and a line for each file of poses that is not used, with the reason.
 
         Raises:
             GavoError: it cannot be read.
         """
-        found = truth_in(folder, stamps, seconds)
+        found = truth_in(folder, stamps, counted)
         return found, unread_truth(folder, found)
 
     @classmethod

@@ -9,6 +9,7 @@ from written_folders import CAMERA_TOML, GREYS, METRES, image, open3d, raw
 
 from gavo_jax.datasets.files import Reading
 from gavo_jax.datasets.registry import open_source
+from gavo_jax.errors import GavoError
 
 STEPS = np.array([0.0, 0.033, 0.1, 0.133])[: len(GREYS)]
 """Times of the frames, seconds: the second gap is that of a dropped frame."""
@@ -104,3 +105,52 @@ def test_a_list_is_told_beside_a_rate_that_the_source_states(tmp_path: Path) -> 
     assert getattr(sequence, "kind", "") == "Open3D reconstruction folder"
     assert sequence.timestamps[1] - sequence.timestamps[0] == pytest.approx(1 / 15)
     assert [line[:9] for line in getattr(sequence, "left_out", [])] == ["times.txt"]
+
+
+COUNTED = {
+    "as many, from 0": (range(1, 13), range(12), 1),
+    "as many, from 1": (range(12), range(1, 13), -1),
+    "of a longer recording": (range(100, 112), range(200), 0),
+    "before the images": (range(5, 17), range(3, 15), 2),
+}
+
+
+@pytest.mark.parametrize("case", COUNTED)
+@pytest.mark.parametrize("file", ["groundtruth.txt", "x.gt.freiburg"])
+def test_poses_by_frame_number_get_the_times_of_the_list(tmp_path: Path, case: str, file: str) -> None:
+    """Poses beyond the list had its first or last time, and a list that begins at 1 or is uneven shifted all."""
+    images, poses, ahead = COUNTED[case]
+    for n in images:
+        image(tmp_path / f"rgb/{n:04}.png", GREYS[0])
+        image(tmp_path / f"depth/{n:04}.png", raw(METRES[0], 1000))
+    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
+    stamps = {n: round(50.0 + n / 15 + 0.01 * (n % 3), 3) for n in images}
+    (tmp_path / "times.txt").write_text("".join(f"{n:04} {stamp:.3f}\n" for n, stamp in stamps.items()))
+    (tmp_path / file).write_text("".join(f"{n} {n} 0 0 0 0 0 1\n" for n in poses))
+    truth = open_source(tmp_path).ground_truth
+    assert truth is not None
+    ahead = ahead if file == "groundtruth.txt" else 0
+    expected = {stamps[n + ahead]: n for n in poses if n + ahead in stamps}
+    np.testing.assert_allclose(truth.timestamps, list(expected))
+    np.testing.assert_allclose(truth.world_T_camera[:, 0, 3], list(expected.values()))
+
+
+def test_a_log_has_no_time_for_a_depth_image_outside_the_list(tmp_path: Path) -> None:
+    """Its pose got the time of the last frame, beside that frame's own."""
+    folder_of(tmp_path, "{i:04d}.png")
+    image(tmp_path / "depth/0004.png", raw(METRES[0], 1000))
+    (tmp_path / "times.txt").write_text(rows("{t:.3f}"))
+    pose = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
+    (tmp_path / "trajectory.log").write_text("".join(f"{n} {n} {n + 1}\n{pose}" for n in range(5)))
+    truth = open_source(tmp_path).ground_truth
+    assert truth is not None
+    np.testing.assert_allclose(truth.timestamps, STEPS)
+
+
+def test_a_trajectory_of_icl_for_other_images_is_refused(tmp_path: Path) -> None:
+    """It was of no pose, or of all poses at one time."""
+    folder_of(tmp_path)
+    (tmp_path / "times.txt").write_text(rows("{t:.3f}"))
+    (tmp_path / "x.gt.freiburg").write_text("7 0 0 0 0 0 0 1\n8 0 0 0 0 0 0 1\n")
+    with pytest.raises(GavoError, match=r"x\.gt\.freiburg: none of its frames \(7 to 8\) has an image"):
+        open_source(tmp_path)
