@@ -27,6 +27,7 @@ from gavo_jax.camera_files.words import (
     CAMERA_KEYS,
     DEVICE_KEYS,
     FOCAL,
+    LENS_MODEL,
     MATRIX,
     first,
     known,
@@ -193,6 +194,8 @@ def _read_flat(path: Path, values: Table) -> Table:
     """Looks like a camera of single numbers."""
     refuse_bop_camera(path, values)
     kept = {*CAMERA_KEYS, *DEVICE_KEYS} - {"depth_scale"}
+    if first(values, LENS_MODEL) is not None:
+        kept.remove("distortion")  # belongs to that model
     ours = {key: value for key, value in values.items() if key in kept or not known(key)}
     others = {key: value for key, value in values.items() if key not in ours}
     return {**ours, **rest_of_camera(str(path), others)}

@@ -282,6 +282,22 @@ def test_lens_and_unit_go_by_all_their_common_names(tmp_path, name):
     assert found.depth_delay == (-0.02 if name == "delay.yaml" else 0.0)
 
 
+@pytest.mark.parametrize("name", ["distortion", "D"])
+@pytest.mark.parametrize("by", [{"distortion_model": "kannala_brandt"}, {"distortion_type": "KB4"}])
+@pytest.mark.parametrize("ending", ["json", "yaml"])
+def test_a_lens_model_holds_whatever_the_coefficients_are_called(tmp_path, name, by, ending):
+    """Beside `distortion` itself an unknown model was dropped, and the lens taken for a pinhole's."""
+    path, size = tmp_path / f"camera.{ending}", {"width": 640, "height": 480}
+    path.write_text(json.dumps({**FLAT, **size, name: EQUIDISTANT, **by}))
+    with pytest.raises(GavoError, match=rf"camera\.{ending}: model: '{next(iter(by.values()))}' is not one of"):
+        load_calibration(path)
+    for known in ({"distortion_model": "equidistant"}, {"camera_model": "fisheye"}, {"is_fisheye": True}):
+        path.write_text(json.dumps({**FLAT, **size, name: EQUIDISTANT, **known}))
+        assert load_calibration(path).color == FISH
+    path.write_text(json.dumps({**FLAT, **size, name: RADTAN, "distortion_model": "radtan"}))
+    assert load_calibration(path).color == BROWN
+
+
 @pytest.mark.parametrize(
     ("more", "words"),
     [
