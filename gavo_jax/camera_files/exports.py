@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax.camera_files.words import Table, rest_of_camera
+from gavo_jax.camera_files.words import Table, numbers_of, rest_of_camera
 from gavo_jax.errors import GavoError, shown
 
 Rays = tuple[np.ndarray, np.ndarray]
@@ -129,7 +129,10 @@ def common_camera(place: str, cameras: list[Table]) -> Table:
     return {**rest[0], **dict(zip(moved, middle.tolist(), strict=True))}
 
 
-NERF_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model")
+NERF_KEYS = (
+    *("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2"),
+    *("camera_model", "is_fisheye", "distortion_params"),
+)
 """Keys of a camera in NeRF's transforms, where each frame has its own."""
 
 
@@ -153,7 +156,15 @@ def read_nerfstudio(path: Path, values: Table) -> Table:
         )
     table = {"fx": values["fl_x"], "fy": values.get("fl_y", values["fl_x"]), "cx": values["cx"], "cy": values["cy"]}
     table |= next(({"depth_scale": 1 / values[key]} for key in NERF_UNITS if values.get(key)), {})
-    model = values.get("camera_model", "OPENCV")
+    if any(numbers_of(values.get("distortion_params"))):
+        raise GavoError(
+            f"{path}: distortion_params: their order is not certain: write them as k1, k2, p1 and p2, or k1 to k4 of a "
+            "fisheye"
+        )
+    is_fisheye = values.get("is_fisheye")  # instant-ngp's word for it
+    model = values.get("camera_model", "OPENCV_FISHEYE" if is_fisheye else "OPENCV")
+    if is_fisheye and model != "OPENCV_FISHEYE":
+        raise GavoError(f"{path}: is_fisheye contradicts camera_model {shown(model)}: remove the wrong one")
     if model == "OPENCV_FISHEYE":
         return {**table, **size, "model": "fisheye", "distortion": [values.get(f"k{i}", 0.0) for i in range(1, 5)]}
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE") or values.get("k4"):
@@ -167,12 +178,12 @@ def read_nerfstudio(path: Path, values: Table) -> Table:
 def _nerf_cameras(values: Table) -> list[Table]:
     """Cameras of the frames; missing keys come from the top level, as in instant-ngp and NeRFCapture.
 
-    Empty if there are no frames, or if only the top level has a focal length.
+    Empty if there are no frames, or if only the top level has a camera.
     """
     frames = values.get("frames")
     told = [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
     above = {key: values[key] for key in NERF_KEYS if key in values}
-    if "fl_x" in above and not any("fl_x" in frame for frame in told):
+    if "fl_x" in above and not any(key in frame for frame in told for key in NERF_KEYS):
         return []
     return [{**above, **{key: frame[key] for key in NERF_KEYS if key in frame}} for frame in told]
 

@@ -201,6 +201,28 @@ def test_transforms_say_the_unit_of_depth_in_metres(tmp_path, key):
     assert found.states_depth_scale and found.color.depth_scale == pytest.approx(6553.5)
 
 
+@pytest.mark.parametrize("place", ["top", "frames", "frames without a focal length"])
+def test_transforms_say_a_lens_in_other_words(tmp_path, place):
+    """A fisheye by its flag alone, and coefficients in a list, were read as a pinhole without distortion."""
+    path = tmp_path / "transforms.json"
+
+    def write(**lens: object) -> None:
+        frames = [{**({} if place.endswith("length") else NERF), **lens}] * 2
+        path.write_text(json.dumps({**NERF, **lens} if place == "top" else {**NERF, "frames": frames}))
+
+    write(is_fisheye=True, **FISH_LENS)
+    assert load_calibration(path).color == FISH
+    write(is_fisheye=False, distortion_params=[0.0] * 6, **LENS)
+    assert load_calibration(path).color == BROWN
+    for faulty, words in (
+        ({"distortion_params": RADTAN}, "distortion_params: their order is not certain: write them as"),
+        ({"is_fisheye": True, "camera_model": "OPENCV"}, "is_fisheye contradicts camera_model 'OPENCV'"),
+    ):
+        write(**faulty)
+        with pytest.raises(GavoError, match=rf"transforms\.json: {words}"):
+            load_calibration(path)
+
+
 K = {"K": MATRIX.tolist(), "width": 640, "height": 480}
 SDK = {key: value for key, value in REALSENSE.items() if key not in ("model", "coeffs")}
 FLAT = {"fx": 500.0, "fy": 510.0, "cx": 319.5, "cy": 239.5}
