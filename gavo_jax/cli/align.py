@@ -2,7 +2,9 @@
 
 import itertools
 import sys
+from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,10 +19,12 @@ from gavo_jax.cli.selection import check_positive, choose_settings
 from gavo_jax.datasets.depth_doubts import fault_of_depth
 from gavo_jax.datasets.depth_unit import lack_of_depth
 from gavo_jax.datasets.files import Entry, FileSequence, Reading, open_pair, size_of_most
+from gavo_jax.datasets.images import read_depth
 from gavo_jax.datasets.own_camera import own_camera_file, preset_by_name
-from gavo_jax.datasets.registry import open_source, source_around
+from gavo_jax.datasets.registry import open_source, recognise, source_around
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import rotation_angle
+from gavo_jax.image.numbers import Depth
 from gavo_jax.interrupts import interruptible
 from gavo_jax.output.files import json_text
 from gavo_jax.output.screen import say, waiting
@@ -40,8 +44,8 @@ def align(options: Align) -> int:
     for path in itertools.chain.from_iterable(images):
         if not path.is_file():
             raise GavoError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
-    calibration, depth_scale = _cameras(options)
-    pair = open_pair(images, calibration, Reading(depth_scale=depth_scale))
+    calibration, depth_scale, depth_in = _source(options)
+    pair = open_pair(images, calibration, Reading(depth_scale=depth_scale), depth_in)
     (reference, target), camera = pair, pair.camera
     if not options.force:
         faults = [
@@ -101,18 +105,22 @@ def in_words(found: Alignment) -> str:
     )
 
 
-def _cameras(options: Align) -> tuple[Calibration, float | None]:
-    """Return the calibration and, if known, the depth units per metre, from the images' source if they belong to one.
+def _source(options: Align) -> tuple[Calibration, float | None, Callable[[Path], Depth]]:
+    """Return the calibration, the depth units per metre if known, and what reads a depth file, all from the images'
+    source if they belong to one.
 
     Raises:
         GavoError: no camera is found or readable, or the source is unreadable and nothing else states the unit.
     """
-    source, fault = source_around(options.rgb0), None
+    source, fault, depth_in = source_around(options.rgb0), None, read_depth
     if source is not None:
+        if isinstance(kind := recognise(source), type) and issubclass(kind, FileSequence):
+            depth_in = kind.depth_in
         try:
             sequence = open_source(source, Reading(options.camera, options.depth_scale))
             if isinstance(sequence, FileSequence):
-                return sequence.calibration.with_depth_scale(sequence.depth_unit.file), options.depth_scale
+                calibration = sequence.calibration.with_depth_scale(sequence.depth_unit.file)
+                return calibration, options.depth_scale, sequence.depth_in
         except GavoError as error:  # faults of the source's other frames don't affect this pair
             fault = error
     size = partial(size_of_most, [Entry(0.0, options.rgb0, options.depth0)])
@@ -124,4 +132,4 @@ def _cameras(options: Align) -> tuple[Calibration, float | None]:
         found = load_calibration(options.camera, size)
     if fault is not None and not found.states_depth_scale and options.depth_scale is None:
         raise GavoError(f"{fault}; to ignore the other frames, pass --depth-scale")
-    return found, options.depth_scale
+    return found, options.depth_scale, depth_in

@@ -142,6 +142,7 @@ class FileSequence:
         ground_truth: Trajectory | None = None,
         reading: Reading = Reading(),
         left_out: Sequence[str] = (),
+        depth_in: Callable[[Path], Depth] | None = None,
     ) -> None:
         """Store the paths of the files; none is read yet.
 
@@ -152,6 +153,7 @@ class FileSequence:
             ground_truth: the true trajectory, with its own stamps.
             reading: only `depth_scale`, `color` and `undistort` are used.
             left_out: files that are not used, and why, one line each.
+            depth_in: reads a depth file, in place of the method of that name.
         """
         self.name, self.ground_truth, self.left_out = name, ground_truth, tuple(left_out)
         self.entries = list(entries)
@@ -159,7 +161,8 @@ class FileSequence:
             calibration = calibration.with_depth_scale(reading.depth_scale)
         self.calibration = calibration
         self._timestamps = np.array([entry.stamp for entry in self.entries])
-        self._images = _Images(self.entries, calibration, reading, self.scale_is_open, self.depth_in)
+        self._depth_in = depth_in or self.depth_in
+        self._images = _Images(self.entries, calibration, reading, self.scale_is_open, self._depth_in)
 
     @property
     def timestamps(self) -> Float[np.ndarray, " frames"]:
@@ -211,7 +214,7 @@ class FileSequence:
         assert entry.depth is not None
         return self._images.assembler.frame(
             _color(entry.color),
-            DepthImage(self.depth_in(entry.depth), str(entry.depth)),
+            DepthImage(self._depth_in(entry.depth), str(entry.depth)),
             str(entry.color),
             entry.stamp,
             entry.depth_stamp,
@@ -222,7 +225,7 @@ class FileSequence:
         entry = self.entries[index]
         if entry.depth is None:
             raise TimestampError(entry.doubt)
-        return self.depth_in(entry.depth)
+        return self._depth_in(entry.depth)
 
     @classmethod
     def depth_in(cls, file: Path) -> Depth:
@@ -356,7 +359,10 @@ class _Images:
 
 
 def open_pair(
-    images: Sequence[tuple[str | Path, str | Path]], calibration: Calibration, reading: Reading = Reading()
+    images: Sequence[tuple[str | Path, str | Path]],
+    calibration: Calibration,
+    reading: Reading = Reading(),
+    depth_in: Callable[[Path], Depth] = read_depth,
 ) -> FileSequence:
     """Open a few frames given as pairs of a colour and a depth image.
 
@@ -364,6 +370,7 @@ def open_pair(
         images: paths of colour and depth for each frame.
         calibration: the cameras of all frames.
         reading: as in `FileSequence`.
+        depth_in: reads a depth file the way their source stores it.
 
     Raises:
         GavoError: one file is given as both colour and depth.
@@ -372,4 +379,4 @@ def open_pair(
         if Path(color) == Path(depth):
             raise GavoError(f"{color}: given as both colour and depth")
     entries = [Entry(0.0, Path(color), Path(depth)) for color, depth in images]
-    return FileSequence("pair", entries, calibration, reading=reading)
+    return FileSequence("pair", entries, calibration, reading=reading, depth_in=depth_in)

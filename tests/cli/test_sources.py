@@ -106,6 +106,21 @@ def test_a_pair_of_a_source_has_its_camera_and_its_unit(gavo, tmp_path, layout):
     np.testing.assert_allclose(np.array(answer["target_T_reference"])[:3, 3], target_T_reference[:3, 3], atol=2e-3)
 
 
+@pytest.mark.parametrize("fault", [False, True])
+def test_a_pair_of_airsim_has_its_depth_the_right_way_up(gavo, tmp_path, fault):
+    """Its PFM files run from the top, which only the recording as a whole knew."""
+    clip = tmp_path / "clip"
+    LAYOUTS["airsim"][1](clip)
+    colors, depths = (sorted(clip.glob(f"images/img_SimpleFlight_0_{kind}")) for kind in ("0_*", "1_*"))
+    if fault:
+        (clip / "groundtruth.txt").write_text("nonsense\n")
+    unit = ("--depth-scale", 1) if fault else ()
+    done = gavo("align", colors[0], depths[0], colors[2], depths[2], *FAST, *unit)
+    assert done.status == 0, done.err
+    target_T_reference = np.linalg.inv(POSES[2]) @ POSES[0]
+    np.testing.assert_allclose(np.array(json.loads(done.out)["target_T_reference"]), target_T_reference, atol=2e-3)
+
+
 def test_a_pair_is_aligned_whatever_is_wrong_with_the_rest_of_its_source(gavo, clip):
     names = [clip / f"{part}/{stamp}.png" for stamp in ("0.000000", "0.033333") for part in ("rgb", "depth")]
     (clip / "groundtruth.txt").write_text("nonsense\n")
