@@ -37,12 +37,17 @@ class BopScene(NumberedFolder):
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """The camera file in the folder, else the common camera of the frames; the depth unit is the scene's."""
         file, size = path / cls.FILE, size_of_most(entries)
-        frames = _frames(file)
-        scale = _depth_scale(file, list(frames.values()))
+        scale = cls.unit(path, reading)
         if (own := own_camera_file(path)) is not None:
             return load_calibration(own, size, scale)
-        matrices = [frame["cam_K"] for frame in frames.values() if "cam_K" in frame]
+        matrices = [frame["cam_K"] for frame in _frames(file).values() if "cam_K" in frame]
         return of_matrices(file, matrices, size, scale)
+
+    @classmethod
+    def unit(cls, path: Path, reading: Reading) -> float:
+        """That of the scene, unless it is given."""
+        file = path / cls.FILE
+        return reading.depth_scale or _depth_scale(file, list(_frames(file).values()))
 
     @classmethod
     def poses(cls, path: Path) -> dict[int, Float[np.ndarray, "4 4"]]:

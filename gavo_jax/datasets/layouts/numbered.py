@@ -43,7 +43,7 @@ class NumberedFolder(FileSequence):
     poses_of_depth: ClassVar[bool] = False
     """Whether the poses are those of the depth camera, if it differs from the colour camera."""
     DEPTH_SCALE: ClassVar[float] = MILLIMETRES
-    """Depth units per metre, if a given camera file does not state them."""
+    """Depth units per metre, if neither a given camera file nor the folder states them."""
     STAMPS: ClassVar[str] = ""
     """Name of the file that `stamps` reads, for messages."""
 
@@ -65,7 +65,16 @@ class NumberedFolder(FileSequence):
             GavoError: there is none, or it cannot be read.
         """
         size, file = size_of_most(entries), own_camera_file(path)
-        return cls.own_camera(path, size) if file is None else load_calibration(file, size, cls.DEPTH_SCALE)
+        return cls.own_camera(path, size) if file is None else load_calibration(file, size, cls.unit(path, reading))
+
+    @classmethod
+    def unit(cls, path: Path, reading: Reading) -> float:
+        """Depth units per metre, if a given camera file does not state them.
+
+        Raises:
+            GavoError: the folder states them, and they cannot be read.
+        """
+        return cls.DEPTH_SCALE
 
     @classmethod
     def own_camera(cls, path: Path, size: Size) -> Calibration:
@@ -111,7 +120,7 @@ class NumberedFolder(FileSequence):
             raise GavoError(f"{path / cls.STAMPS}: contains no row for any of these frames")
         entries = [Entry(times[number], found.color[number], found.depth[number]) for number in numbers]
         own = partial(cls.calibrate, path, entries, reading)
-        calibration = reading.calibration(own, partial(size_of_most, entries), cls.DEPTH_SCALE)
+        calibration = reading.calibration(own, partial(size_of_most, entries), cls.unit(path, reading))
         if cls.depth_is_of_view:
             calibration = calibration.with_depth_of_size(*depth_size_of_most(entries))
         if (path / TRUTH).exists():  # a custom ground truth overrides the dataset's poses

@@ -267,6 +267,21 @@ def test_a_room_of_semantic_nerf_was_rendered_with_a_view_of_90_degrees(folder):
     assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.depth_scale) == (80, 80, 79.5, 59.5, 1000)
 
 
+@pytest.mark.parametrize("as_file", [True, False])
+def test_a_given_camera_leaves_the_unit_of_a_scene_of_bop(folder, tmp_path, as_file):
+    """Depth was read in millimetres, as if the scene did not state its unit."""
+    wrote(folder, "bop")
+    (tmp_path / "mine.txt").write_text("131 131 79.5 59.5\n")
+    given = str(tmp_path / "mine.txt") if as_file else CAMERA
+    assert open_source(folder, Reading(camera=given)).camera.depth_scale == 10000
+    file = folder / "scene_camera.json"
+    file.write_text(file.read_text().replace('"depth_scale": 0.1', '"depth_scale": 1.0', 1))
+    with pytest.raises(GavoError, match=r"scene_camera\.json: depth_scale: expected one number .*: pass --depth-scale"):
+        open_source(folder, Reading(camera=given))
+    for camera in (given, "auto"):
+        assert open_source(folder, Reading(camera=camera, depth_scale=2000)).camera.depth_scale == 2000
+
+
 def test_a_scene_in_grey_of_bop_has_its_images_in_gray(folder):
     wrote(folder, "bop")
     (folder / "rgb").rename(folder / "gray")
