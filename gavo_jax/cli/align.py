@@ -1,6 +1,7 @@
 """`gavo align`: aligns one pair of RGB-D images and prints the motion as JSON."""
 
 import itertools
+import os
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -20,7 +21,7 @@ from gavo_jax.datasets.depth_doubts import fault_of_depth
 from gavo_jax.datasets.depth_unit import lack_of_depth
 from gavo_jax.datasets.files import Entry, FileSequence, Reading, open_pair, size_of_most
 from gavo_jax.datasets.images import read_depth
-from gavo_jax.datasets.own_camera import own_camera_file, preset_by_name
+from gavo_jax.datasets.own_camera import nearest_camera_file, preset_by_name
 from gavo_jax.datasets.registry import open_source, recognise, source_around
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import rotation_angle
@@ -125,8 +126,8 @@ def _source(options: Align) -> tuple[Calibration, float | None, Callable[[Path],
             fault = error
     size = partial(size_of_most, [Entry(0.0, options.rgb0, options.depth0)])
     if options.camera == "auto":
-        folder = options.rgb0.absolute().parent
-        file = own_camera_file(folder) or own_camera_file(folder.parent)
+        folder = Path(os.path.abspath(options.rgb0)).parent
+        file = nearest_camera_file(folder)
         found = preset_by_name(folder.parent) if file is None else load_calibration(file, size)
     else:
         found = load_calibration(options.camera, size)

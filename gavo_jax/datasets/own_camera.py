@@ -55,6 +55,17 @@ def own_camera_file(folder: Path) -> Path | None:
     return file
 
 
+def nearest_camera_file(folder: Path) -> Path | None:
+    """The camera file in a folder, else one folder up: of a link to it, beside the link before what it points to.
+
+    Raises:
+        GavoError: as `own_camera_file`.
+    """
+    above = [folder.parent] if folder.name != ".." else []  # the parent of `..` is the folder that it leaves
+    found = (own_camera_file(place) for place in (folder, *above, folder.resolve().parent))
+    return next((file for file in found if file is not None), None)
+
+
 def info_of_scan(folder: Path) -> Path | None:
     """The info file of a scan, with both cameras, in a folder; None if there is none."""
     files = (folder / name for name in SCANS)

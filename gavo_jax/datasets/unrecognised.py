@@ -1,5 +1,6 @@
 """Helpful messages for a path that holds no known source: each guess returns a message, or None to let the next try."""
 
+import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -104,7 +105,7 @@ def describe(path: Path, kinds: Sequence[str], is_source: Callable[[Path], bool]
 
 def source_around(path: Path, is_source: Callable[[Path], bool]) -> Path | None:
     """The folder of the source that a file or folder belongs to; None if there is none."""
-    return next((folder for folder in list(path.absolute().parents)[:2] if is_source(folder)), None)
+    return next((folder for folder in list(Path(os.path.abspath(path)).parents)[:2] if is_source(folder)), None)
 
 
 def _lone_file(place: Place) -> str | None:

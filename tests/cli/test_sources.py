@@ -106,6 +106,22 @@ def test_a_pair_of_a_source_has_its_camera_and_its_unit(gavo, tmp_path, layout):
     np.testing.assert_allclose(np.array(answer["target_T_reference"])[:3, 3], target_T_reference[:3, 3], atol=2e-3)
 
 
+@pytest.mark.parametrize("part", ["rgb", "rgb/late"])
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_a_pair_named_from_within_its_folder_is_of_the_same_source(gavo, clip, monkeypatch, part, is_whole):
+    """`../0.png` was looked for beside the folder that it leaves."""
+    (clip / "rgb/late").mkdir()
+    if not is_whole:
+        (clip / "rgb.txt").unlink()
+        (clip / "camera.toml").write_text("fx = 140\nfy = 140\ncx = 79.5\ncy = 59.5\nwidth = 160\nheight = 120\n")
+    monkeypatch.chdir(clip / part)
+    up = "../" * part.count("/")
+    names = [f"{up}{there}/{stamp}.png" for stamp in ("0.000000", "0.033333") for there in (".", "../depth")]
+    done = gavo("align", *names, *FAST, *(() if is_whole else ("--depth-scale", 5000)))
+    assert done.status == 0, done.err
+    assert "camera.toml" in json.loads(done.out)["camera_from"]
+
+
 @pytest.mark.parametrize("fault", [False, True])
 def test_a_pair_of_airsim_has_its_depth_the_right_way_up(gavo, tmp_path, fault):
     """Its PFM files run from the top, which only the recording as a whole knew."""

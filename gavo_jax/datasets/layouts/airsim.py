@@ -15,7 +15,7 @@ from gavo_jax.datasets.files import Entry, Reading, size_of_most
 from gavo_jax.datasets.images import read_depth
 from gavo_jax.datasets.layouts.pairing import Paired, paired_at
 from gavo_jax.datasets.layouts.plain_folder import PlainFolder
-from gavo_jax.datasets.own_camera import own_camera_file
+from gavo_jax.datasets.own_camera import nearest_camera_file
 from gavo_jax.datasets.truth import Seconds
 from gavo_jax.errors import GavoError, read_text
 from gavo_jax.image.numbers import Depth
@@ -73,7 +73,7 @@ class AirSim(PlainFolder):
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """The camera file in the folder or in its parent."""
-        file = own_camera_file(path) or own_camera_file(path.parent)
+        file = nearest_camera_file(path)
         if file is None:
             usual = "with AirSim's default FOV_Degrees of 90, fx and fy are half the width"
             raise GavoError(f"{path}: no camera file in it: pass --camera, or put a camera.toml into it; {usual}")

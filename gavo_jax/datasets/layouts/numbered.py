@@ -22,7 +22,7 @@ from gavo_jax.datasets.files import Entry, FileSequence, Reading, Size, depth_si
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from gavo_jax.datasets.layouts.image_folders import plain_files
 from gavo_jax.datasets.names import Found, by_number, images_among
-from gavo_jax.datasets.own_camera import own_camera_file
+from gavo_jax.datasets.own_camera import nearest_camera_file, own_camera_file
 from gavo_jax.datasets.truth import TRUTH, Counted, in_order, pose_files, pose_in, pose_of, truth_in
 from gavo_jax.errors import GavoError
 from gavo_jax.trajectory import Trajectory, inverse
@@ -172,7 +172,7 @@ class SevenScenes(NumberedFolder):
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """The camera file or a scan's info.txt in the folder or its parent, else the dataset's camera."""
-        file = own_camera_file(path) or own_camera_file(path.resolve().parent)
+        file = nearest_camera_file(path)
         if file is None:
             return Calibration(cls.CAMERA, origin="the one of 7-Scenes")
         return _millimetres(load_calibration(file, partial(size_of_most, entries), MILLIMETRES))
@@ -254,7 +254,7 @@ class Replica(NumberedFolder):
     @classmethod
     def calibrate(cls, path: Path, entries: Sequence[Entry], reading: Reading) -> Calibration:
         """The camera file (cam_params.json) of the room or of all rooms, else the camera used for rendering."""
-        file = own_camera_file(path) or own_camera_file(path.parent)
+        file = nearest_camera_file(path)
         if file is None:
             return Calibration(cls.CAMERA, origin="the one that Replica was rendered with")
         return load_calibration(file, partial(size_of_most, entries), cls.CAMERA.depth_scale)

@@ -14,7 +14,7 @@ from gavo_jax.datasets.layouts.listed_times import listed_times
 from gavo_jax.datasets.layouts.nerf import TRANSFORMS, read_transforms
 from gavo_jax.datasets.layouts.numbered import NUMBERS, RATE
 from gavo_jax.datasets.layouts.pairing import Paired, paired_by_number, paired_by_stamp
-from gavo_jax.datasets.own_camera import own_camera_file, preset_or_export, told_in
+from gavo_jax.datasets.own_camera import nearest_camera_file, preset_or_export, told_in
 from gavo_jax.datasets.truth import Seconds, truth_in, unread_truth
 from gavo_jax.trajectory import Trajectory
 
@@ -53,7 +53,7 @@ class PlainFolder(FileSequence):
             GavoError: there is none.
         """
         load = partial(load_calibration, size=partial(size_of_most, entries), depth_scale=MILLIMETRES)
-        file = own_camera_file(path) or own_camera_file(path.parent)
+        file = nearest_camera_file(path)
         return preset_or_export(path, load) if file is None else load(file)
 
     @classmethod

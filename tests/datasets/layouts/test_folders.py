@@ -68,6 +68,26 @@ def test_a_folder_named_as_7_scenes_has_a_camera_of_its_own(folder, name):
     assert open_source(folder).camera.fx == 140
 
 
+@pytest.mark.parametrize("layout", ["plain", "replica", "airsim", "seven_scenes"])
+@pytest.mark.parametrize("way", [".", "..", "inner/..", "../clip", "../link"])
+def test_one_folder_up_is_found_by_every_way_into_the_folder(folder, monkeypatch, layout, way):
+    """From within, `.` had no folder above it, and the one above `..` was the one within."""
+    wrote(folder, layout)
+    for file in ("camera.yaml", "camera.toml", "cam_params.json", "camera-intrinsics.txt"):
+        (folder / file).unlink(missing_ok=True)
+    (folder / "inner").mkdir()
+    (folder / "inner/camera.toml").write_text(CAMERA_TOML.replace("131", "150"))
+    (folder.parent / "camera.toml").write_text(CAMERA_TOML.replace("131", "140"))
+    (folder.parent / "apart").mkdir()
+    (folder.parent / "apart/link").symlink_to(folder)
+    inside = {"..": folder / "inner", "../link": folder.parent / "apart/here"}.get(way, folder)
+    inside.mkdir(exist_ok=True)
+    monkeypatch.chdir(inside)
+    assert open_source(way).camera.fx == 140
+    (folder.parent / "apart/camera.toml").write_text(CAMERA_TOML.replace("131", "145"))
+    assert open_source(way).camera.fx == (145 if way == "../link" else 140)
+
+
 def test_what_is_made_of_a_frame_is_not_the_frame(folder):
     """7-Scenes comes with depth projected into colour, 3RScan with rendered images: two of one number were refused."""
     wrote(folder, "seven_scenes")
