@@ -37,6 +37,9 @@ MOST_VIGNETTING = 6
 DEPTH_SCALE = 5000.0
 """Default depth scale, units per metre: the TUM benchmark's."""
 
+MOST_DELAY = 0.1
+"""Largest plausible delay between colour and depth, seconds; more is of another frame."""
+
 LARGEST_SHIFT = 10.0
 """Metres between the colour and the depth camera of one device; more is a unit mistaken."""
 
@@ -61,7 +64,8 @@ class Calibration:
         origin: where the numbers come from, for messages.
         states_depth_scale: whether that source states the depth scale; else `color.depth_scale` is an assumption.
         preset: the preset's name, if it is one, so that the sensor is known.
-        depth_delay: seconds from depth's stamp (the colour image's, if it has none) to its actual time.
+        depth_delay: seconds from depth's stamp (the colour image's, if it has none) to its actual time, up to
+            `MOST_DELAY`.
     """
 
     color: Camera
@@ -73,7 +77,9 @@ class Calibration:
     depth_delay: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raise GavoError if the depth camera's pose is missing or not a rigid transform."""
+        """Raise GavoError if the depth camera's pose is missing or not a rigid transform, or the delay is too long."""
+        if not abs(self.depth_delay) <= MOST_DELAY:
+            raise GavoError(f"depth_delay: must be from -{MOST_DELAY:g} to {MOST_DELAY:g} s, not {self.depth_delay:g}")
         if (self.depth is None) != (self.color_T_depth is None):
             raise GavoError("a calibration needs a depth camera and color_T_depth, or neither if depth is registered")
         place = self.color_T_depth
@@ -166,7 +172,7 @@ def load_calibration(
             raise GavoError(f"{path}: {key[:60]!r}: unknown key (known: {', '.join(known)})")
     depth, color_T_depth = _depth_camera(path, table)
     own = {key: value for key, value in table.items() if key not in DEVICE_KEYS + RIG_KEYS}
-    delay = _number(f"{path}: depth_delay", table.get("depth_delay", 0.0), -1, 1)
+    delay = _number(f"{path}: depth_delay", table.get("depth_delay", 0.0), -MOST_DELAY, MOST_DELAY)
     if isinstance(table.get("depth"), dict) and "depth_scale" in table["depth"]:
         own["depth_scale"] = table["depth"]["depth_scale"]
     color = camera_from_table(path, own, depth_scale)

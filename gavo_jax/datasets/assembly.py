@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt16
 
 from gavo_jax.camera import Camera
-from gavo_jax.camera_files.calibration import Calibration
+from gavo_jax.camera_files.calibration import MOST_DELAY, Calibration
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.images import to_8_bits, white_of, without_invalid
 from gavo_jax.datasets.registration import Registration
@@ -202,8 +202,9 @@ class FrameAssembler:
         """
         camera = self.recorded
         if self.calibration.depth_delay:
-            stamped = timestamp if depth_timestamp is None else depth_timestamp
-            depth_timestamp = stamped + self.calibration.depth_delay
+            apart = 0.0 if depth_timestamp is None else depth_timestamp - timestamp
+            total = self.calibration.depth_delay + (apart if abs(apart) <= MOST_DELAY else 0.0)
+            depth_timestamp = timestamp + min(max(total, -MOST_DELAY), MOST_DELAY)
         _check_size(bgr, self.calibration.color, name, "camera")
         if bgr.dtype != np.uint8 and np.mean(bgr > self.white) > MAX_EXCESS_SHARE:
             brighter = "is brighter than the images that were sampled"

@@ -9,6 +9,7 @@ from jax.core import Tracer
 from jaxtyping import Float, UInt8
 
 from gavo_jax.camera import Camera, require_camera
+from gavo_jax.camera_files.calibration import MOST_DELAY
 from gavo_jax.errors import GavoError, as_number
 from gavo_jax.image.numbers import Depth, is_real
 from gavo_jax.trajectory import Trajectory
@@ -98,8 +99,6 @@ class TimestampError(FrameError):
 
 SAME_STAMP = 1e-6
 """Largest change of a stamp by writing it to a file, seconds."""
-MOST_DELAY = 0.1
-"""Largest plausible delay between colour and depth, seconds; a depth stamp further off is ignored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,9 +130,9 @@ class Frame:
 
     @property
     def depth_delay(self) -> float:
-        """Seconds from the colour image to the depth image; 0 if unknown, or beyond `MOST_DELAY`."""
+        """Seconds from the colour image to the depth image; 0 if unknown, or beyond `MOST_DELAY`: of another clock."""
         delay = 0.0 if self.depth_timestamp is None else self.depth_timestamp - self.timestamp
-        return delay if abs(delay) <= MOST_DELAY else 0.0
+        return delay if abs(delay) <= MOST_DELAY + SAME_STAMP else 0.0
 
     def at(self, timestamp: float) -> "Frame":
         """The same images with another stamp; depth keeps its delay, unless beyond `MOST_DELAY`.

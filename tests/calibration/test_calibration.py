@@ -270,7 +270,7 @@ def test_a_camera_file_holds_what_was_found(tmp_path):
     assert (read.color, read.depth_delay) == (rig.color, rig.depth_delay)
     assert read.depth is not None and read.depth.matrix.tolist() == CAMERA.matrix.tolist()
     (tmp_path / "bad.toml").write_text((tmp_path / "camera.toml").read_text().replace("-0.015", "15"))
-    with pytest.raises(GavoError, match="depth_delay: must be a number from -1 to 1"):
+    with pytest.raises(GavoError, match="depth_delay: must be a number from -0.1 to 0.1"):
         load_calibration(tmp_path / "bad.toml")
 
 
@@ -280,6 +280,38 @@ def test_a_delay_moves_depths_stamp_or_makes_one():
     images = (np.zeros((*shape, 3), np.uint8), DepthImage(np.zeros(shape, np.uint16), "depth"), "colour")
     assert assembler.frame(*images, 2.0).depth_timestamp == pytest.approx(1.985)
     assert assembler.frame(*images, 2.0, 2.01).depth_timestamp == pytest.approx(1.995)
+
+
+@pytest.mark.parametrize(
+    ("delay", "stamp", "total"),
+    [
+        (0.1, None, 0.1),
+        (-0.1, None, -0.1),
+        (0.09, 0.02, 0.1),
+        (-0.1, -0.02, -0.1),
+        (-0.05, 0.09, 0.04),
+        (0.03, 7, 0.03),
+    ],
+)
+def test_a_stated_delay_counts_whatever_the_stamps_say(delay, stamp, total):
+    """Where both made more than a tenth of a second, or the stamps were of two clocks, depth had no delay at all."""
+    shape, time = (CAMERA.height, CAMERA.width), 1305031102.175304
+    assembler = FrameAssembler(Calibration(CAMERA, depth_delay=delay), DepthUnit(5000.0, 5000.0))
+    images = (np.zeros((*shape, 3), np.uint8), DepthImage(np.zeros(shape, np.uint16), "depth"), "colour")
+    frame = assembler.frame(*images, time, None if stamp is None else time + stamp)
+    assert frame.depth_delay == pytest.approx(total, abs=1e-6)
+
+
+@pytest.mark.parametrize("delay", [0.11, -0.3, float("nan")])
+def test_a_delay_that_no_frame_can_have_is_refused(tmp_path, delay):
+    """Beyond a tenth of a second it was read and then ignored."""
+    with pytest.raises(GavoError, match=r"depth_delay: must be from -0\.1 to 0\.1 s, not"):
+        Calibration(CAMERA, depth_delay=delay)
+    write_camera_file(tmp_path / "camera.toml", Calibration(CAMERA, depth_delay=0.1), ())
+    assert load_calibration(tmp_path / "camera.toml").depth_delay == 0.1
+    (tmp_path / "camera.toml").write_text((tmp_path / "camera.toml").read_text().replace("0.1\n", f"{delay}\n"))
+    with pytest.raises(GavoError, match=r"camera\.toml: depth_delay: must be a number from -0\.1 to 0\.1, not"):
+        load_calibration(tmp_path / "camera.toml")
 
 
 def test_what_is_not_determined_stays_as_it_was():
