@@ -23,7 +23,15 @@ from gavo_jax.bodies.scene import AwareState, FrameView, MotionSegmenter
 from gavo_jax.bodies.surfaces import whole_surfaces
 from gavo_jax.datasets.base import Frame
 from gavo_jax.frame_checks import MAX_INTERVAL_RATIO
-from gavo_jax.odometry.aligners import Aligner, Attempt, FrameSearch, agree, is_motion_known, side_by_side
+from gavo_jax.odometry.aligners import (
+    Aligner,
+    Attempt,
+    FrameSearch,
+    agree,
+    checked_for_periods,
+    is_motion_known,
+    side_by_side,
+)
 from gavo_jax.odometry.plausibility import depth_alone_disagrees
 from gavo_jax.odometry.tracking import Clock, TrackerState, as_exposed
 from gavo_jax.rigid_motions import exp, log
@@ -153,7 +161,7 @@ class BodyAware:
         attempt, seconds_extrapolated = seen, 0.0
         if not self.is_eager and self._asks(first, seen, found, before):
             attempt, seconds_extrapolated = self._asked(state, frame, clock, seen)
-        is_vague = attempt.usable and not seconds_extrapolated and deviation(attempt) > MIN_VELOCITY_DEVIATIONS[0]
+        is_vague = attempt.usable and not seconds_extrapolated and attempt.deviation > MIN_VELOCITY_DEVIATIONS[0]
         if not self.is_eager and is_vague and is_motion_known(state.tracker) and np.any(before):
             attempt = self._fused_with_prediction(state, clock, attempt)
         if attempt is not seen:
@@ -299,7 +307,12 @@ class BodyAware:
             best = again
             if gain < GAIN:
                 break
-        return _judged(best, tried, known)
+        judged = _judged(best, tried, known)
+        if best.attempt.usable or not judged.usable:
+            return judged
+        return checked_for_periods(
+            self.search, tracker, judged, frame, clock
+        )  # what the search refused it did not check
 
     def _helped_by_prediction(self, state: AwareState, clock: Clock, attempt: Attempt, covered: float) -> Attempt:
         """Help out an attempt that failed beside bodies with the predicted motion.
@@ -383,11 +396,6 @@ def _judged(best: MotionCandidate, tried: list[MotionCandidate], known: bool) ->
 def mistrusted(attempt: Attempt) -> Attempt:
     """The attempt, flagged as possibly following a body."""
     return attempt._replace(result=with_finding(attempt.result, AlignmentStatus.MOVING_BODY))
-
-
-def deviation(attempt: Attempt) -> float:
-    """Standard deviation of an attempt's translation, metres."""
-    return float(np.sqrt(np.trace(attempt.result.covariance[:3, :3])))
 
 
 def _bodies(belief: Belief, before: Bool[np.ndarray, "h w"], depth_disagrees: bool) -> Integer[np.ndarray, "h w"]:

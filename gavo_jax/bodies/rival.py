@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float64
 
 from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import Alignment
-from gavo_jax.bodies.aligner import BodyAware, deviation, mistrusted
+from gavo_jax.bodies.aligner import BodyAware, mistrusted
 from gavo_jax.bodies.duel import BEGUN, DROPPED_AFTER, EXACT, OVER, Duel, Motions, Span, leads
 from gavo_jax.bodies.identity import BodyTracks
 from gavo_jax.bodies.pixel_evidence import View, inverse_depth_of
@@ -126,7 +126,7 @@ class WithRival:
             if attempt.usable:
                 return self._decide(attempt, other, aged, open_for)
             depth_is_doubted = AlignmentStatus.DEPTH_MISMATCH in attempt.result.statuses
-            if deviation(other) < EXACT and not depth_is_doubted:  # that motion is lost; whose it was stays open
+            if other.deviation < EXACT and not depth_is_doubted:  # that motion is lost; whose it was stays open
                 return self._taken(other, aged, open_for, open_for, clearly=True)
         if not attempt.usable:  # if it is used all the same, a rival would have missed a frame
             rival = self._nobody
@@ -164,7 +164,7 @@ class WithRival:
     def _duel(self, attempt: Attempt, other: Attempt, rival: Rival) -> Duel:
         """Compare the two motions; the anchor's pixels vote only where the choice matters."""
         motions = rival.motions.after(attempt.result, other.result)
-        duel = Duel.of(motions, attempt.result, deviation(other), rival.age, stands_before=bool(rival.stands_before))
+        duel = Duel.of(motions, attempt.result, other.deviation, rival.age, stands_before=bool(rival.stands_before))
         if not duel.asks_for_votes:
             return duel
         both = np.stack([motions.first_T_anchor, motions.rival_T_anchor]).astype(np.float32)

@@ -58,6 +58,11 @@ class Attempt(NamedTuple):
         """Whether the motion is usable and comes from the images: a guess fits any depth and any time."""
         return self.usable and not is_unknown(self.result)
 
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the motion's translation, metres."""
+        return float(np.sqrt(np.trace(self.result.covariance[:3, :3])))
+
 
 class Aligner(Protocol):
     """Finds the motion of a new frame."""
@@ -172,9 +177,6 @@ class Search:
     ) -> Attempt:
         """The attempt that a result makes, checked for being off by a period where the image repeats itself.
 
-        If it may be off and the last motion is known, the attempt is unusable. If the last motion is unknown the result
-        is used, but the next frame gets no prediction from it: that would only repeat the error.
-
         Args:
             state: State before the frame.
             after: State with the frame as the reference.
@@ -183,19 +185,7 @@ class Search:
             clock: When it was taken.
         """
         attempt = Attempt(after, result, result.status == AlignmentStatus.OK)
-        if not attempt.usable:
-            return attempt
-        motion, seconds = np.asarray(result.target_T_reference), float(clock.elapsed)
-        images = frame.grey, frame.depth, self.camera
-        is_known = is_motion_known(state)
-        if is_known:
-            is_open = another_period_fits_expected(motion, result.error, self.predict(state, seconds), *images)
-        else:
-            is_open = another_period_is_in_reach(motion, result.error, seconds, *images)
-        if not is_open:
-            return attempt
-        attempt = attempt._replace(result=with_finding(result, AlignmentStatus.AMBIGUOUS), usable=not is_known)
-        return attempt if is_known else attempt._replace(state=at_rest(after))
+        return checked_for_periods(self, state, attempt, frame, clock)
 
     def predict(self, state: TrackerState, elapsed: float) -> Float64[np.ndarray, "4 4"]:
         """Predict by the twist of the last motion."""
@@ -220,6 +210,36 @@ def at_rest(state: TrackerState) -> TrackerState:
     """A state in which nothing is known of the camera's motion, as after a first frame."""
     still = jnp.zeros(6)
     return state._replace(motion=still, guess=still, instant_motion=still, seconds=jnp.float32(UNKNOWN_SECONDS))
+
+
+def checked_for_periods(
+    search: FrameSearch, state: TrackerState, attempt: Attempt, frame: Frame, clock: Clock
+) -> Attempt:
+    """A usable attempt, checked for being off by a period where the image repeats itself.
+
+    If it may be off and the last motion is known, the attempt is unusable. If the last motion is unknown the result is
+    used, but the next frame gets no prediction from it: that would only repeat the error.
+
+    Args:
+        search: Knows the camera, and predicts.
+        state: State before the frame.
+        attempt: The attempt; one that is not usable is returned as it is.
+        frame: The new frame.
+        clock: When it was taken.
+    """
+    if not attempt.usable:
+        return attempt
+    result, seconds = attempt.result, float(clock.elapsed)
+    motion, images = np.asarray(result.target_T_reference), (frame.grey, frame.depth, search.camera)
+    is_known = is_motion_known(state)
+    if is_known:
+        is_open = another_period_fits_expected(motion, result.error, search.predict(state, seconds), *images)
+    else:
+        is_open = another_period_is_in_reach(motion, result.error, seconds, *images)
+    if not is_open:
+        return attempt
+    attempt = attempt._replace(result=with_finding(result, AlignmentStatus.AMBIGUOUS), usable=not is_known)
+    return attempt if is_known else attempt._replace(state=at_rest(attempt.state))
 
 
 def is_motion_known(state: TrackerState) -> bool:

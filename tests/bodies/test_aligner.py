@@ -197,6 +197,30 @@ def test_a_motion_that_more_of_the_image_contradicts_may_be_a_bodys(
     assert result.status is status
 
 
+@pytest.mark.parametrize("repeats", [False, True])
+def test_an_excused_motion_may_still_be_off_by_a_period(monkeypatch: pytest.MonkeyPatch, repeats: bool) -> None:
+    """Only what a search takes itself is checked for that: beside a body in front of tiles the next tile was `ok`."""
+    monkeypatch.setattr("gavo_jax.odometry.aligners.another_period_fits_expected", lambda *_: repeats)
+    result = no_alignment(AlignmentStatus.HIGH_ERROR)
+    result = result._replace(explained=result.explained._replace(grey=np.float32(0.8), depth=np.float32(0.9)))
+    refused, image, covered = Attempt(None, result, usable=False), np.zeros((8, 10)), np.zeros((8, 10))
+    covered[:, :4] = 1.0
+    belief: Any = Belief(
+        2 * covered - 1, image, np.float32(0.8), np.float32(0.05), covered > 0, image, image, np.ones(2)
+    )  # pyright: ignore
+    search: Any = SimpleNamespace(align=lambda *_: refused, predict=lambda *_: np.eye(4), camera=CAMERA)
+    aware, nothing = BodyAware(search, search), SimpleNamespace(grey=None, depth=None)
+    stand_in = SimpleNamespace(look_back=lambda *_: belief, without=lambda tracker, _: tracker)
+    vars(aware)["segmenter"] = stand_in
+    tracker: Any = SimpleNamespace(motion=np.ones(6), seconds=1 / 30)
+    scene = SimpleNamespace(tracks=SimpleNamespace(labels=np.ones((8, 10))))
+    state: Any = SimpleNamespace(scene=scene, tracker=tracker)
+    clock: Any = SimpleNamespace(elapsed=1 / 30)
+    attempt = aware._share_out(state, nothing, clock, refused)  # pyright: ignore
+    assert attempt.usable is not repeats
+    assert attempt.result.status is (AlignmentStatus.AMBIGUOUS if repeats else AlignmentStatus.OK)
+
+
 @pytest.mark.parametrize(("lost", "is_guessed"), [(0, True), (10, False)])
 def test_the_last_motion_does_not_stand_in_for_frames_that_were_lost(
     monkeypatch: pytest.MonkeyPatch, lost: int, is_guessed: bool
