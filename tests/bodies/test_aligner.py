@@ -20,6 +20,7 @@ from gavo_jax.bodies.pixel_evidence import gather_evidence
 from gavo_jax.bodies.records import Seen, in_world
 from gavo_jax.bodies.scene import MotionSegmenter
 from gavo_jax.compilation import programs
+from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.aligners import Attempt, Search
@@ -203,20 +204,22 @@ def test_an_excused_motion_may_still_be_off_by_a_period(monkeypatch: pytest.Monk
     monkeypatch.setattr("gavo_jax.odometry.aligners.another_period_fits_expected", lambda *_: repeats)
     result = no_alignment(AlignmentStatus.HIGH_ERROR)
     result = result._replace(explained=result.explained._replace(grey=np.float32(0.8), depth=np.float32(0.9)))
-    refused, image, covered = Attempt(None, result, usable=False), np.zeros((8, 10)), np.zeros((8, 10))
-    covered[:, :4] = 1.0
-    belief: Any = Belief(
-        2 * covered - 1, image, np.float32(0.8), np.float32(0.05), covered > 0, image, image, np.ones(2)
-    )  # pyright: ignore
+    refused, image, covered = (
+        Attempt(None, result, usable=False),
+        jnp.zeros((8, 10)),
+        jnp.zeros((8, 10)).at[:, :4].set(1),
+    )
+    shares = jnp.float32(0.8), jnp.float32(0.05), covered > 0
+    belief = Belief(2 * covered - 1, image, *shares, image, image, jnp.ones(2))
     search: Any = SimpleNamespace(align=lambda *_: refused, predict=lambda *_: np.eye(4), camera=CAMERA)
-    aware, nothing = BodyAware(search, search), SimpleNamespace(grey=None, depth=None)
+    aware, frame = BodyAware(search, search), Frame(np.zeros((8, 10), np.uint8), np.zeros((8, 10), np.uint16), 0.0)
     stand_in = SimpleNamespace(look_back=lambda *_: belief, without=lambda tracker, _: tracker)
     vars(aware)["segmenter"] = stand_in
     tracker: Any = SimpleNamespace(motion=np.ones(6), seconds=1 / 30)
     scene = SimpleNamespace(tracks=SimpleNamespace(labels=np.ones((8, 10))))
     state: Any = SimpleNamespace(scene=scene, tracker=tracker)
     clock: Any = SimpleNamespace(elapsed=1 / 30)
-    attempt = aware._share_out(state, nothing, clock, refused)  # pyright: ignore
+    attempt = aware._share_out(state, frame, clock, refused)
     assert attempt.usable is not repeats
     assert attempt.result.status is (AlignmentStatus.AMBIGUOUS if repeats else AlignmentStatus.OK)
 
