@@ -74,26 +74,19 @@ class Open3DTensorPeer:
 
     Settings that differ from the defaults:
     - depth scale: the camera's (default 1000);
-    - largest depth: as given (default 3 m, beyond which a Kinect still sees half of a room);
     - four levels of at most 20 iterations; the default three levels of 10, 5 and 3, coarse to fine, stop well short of
       convergence with the intensity and hybrid methods.
+
+    The largest depth is the default, 3 m: with as much as other peers use, these drift more on most clips.
 
     Open3D returns no flag here: `success` is false if it raises an error for a singular system.
     """
 
     ITERATIONS = (20, 20, 20, 20)  # coarse to fine
 
-    def __init__(self, name: str, camera: Camera, method: str, max_depth: float) -> None:
-        """Set up the odometry.
-
-        Args:
-            name: Name of the peer.
-            camera: Rectified camera of the frames.
-            method: Member of `open3d.t.pipelines.odometry.Method`.
-            max_depth: Largest depth used, metres.
-        """
+    def __init__(self, name: str, camera: Camera, method: str) -> None:
+        """Set up the odometry; method is a member of `open3d.t.pipelines.odometry.Method`."""
         self.name = name
-        self._max_depth = max_depth
         self._open3d = import_open3d("peers")
         self.versions = {"open3d": self._open3d.__version__}
         self._camera = camera
@@ -122,7 +115,6 @@ class Open3DTensorPeer:
                 target,
                 self._intrinsics,
                 depth_scale=float(self._camera.depth_scale),
-                depth_max=self._max_depth,
                 criteria_list=self._criteria,
                 method=self._method,
             )

@@ -50,8 +50,8 @@ def _legacy(name: str, term: str, max_depth: float) -> PeerInfo:
     return PeerInfo(name, "open3d", lambda camera: Open3DLegacyPeer(name, camera, term, max_depth))
 
 
-def _tensor(name: str, method: str, max_depth: float) -> PeerInfo:
-    return PeerInfo(name, "open3d", lambda camera: Open3DTensorPeer(name, camera, method, max_depth))
+def _tensor(name: str, method: str) -> PeerInfo:
+    return PeerInfo(name, "open3d", lambda camera: Open3DTensorPeer(name, camera, method))
 
 
 def _features(name: str, kind: FeatureKind) -> PeerInfo:
@@ -68,9 +68,9 @@ PEERS: dict[str, PeerInfo] = {
         _features("orb-pnp", "orb"),
         _legacy("open3d-color", "RGBDOdometryJacobianFromColorTerm", 10.0),
         _legacy("open3d-hybrid", "RGBDOdometryJacobianFromHybridTerm", 4.0),
-        _tensor("open3d-tensor-intensity", "Intensity", 10.0),
-        _tensor("open3d-tensor-hybrid", "Hybrid", 4.0),
-        _tensor("open3d-tensor-point-to-plane", "PointToPlane", 4.0),
+        _tensor("open3d-tensor-intensity", "Intensity"),
+        _tensor("open3d-tensor-hybrid", "Hybrid"),
+        _tensor("open3d-tensor-point-to-plane", "PointToPlane"),
         PeerInfo(
             "small-gicp",
             "small_gicp",
