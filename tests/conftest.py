@@ -17,8 +17,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # of what a shell starts 
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # XLA's older way to write out a program, and fewer of LLVM's passes over it, take a third of the time, and the program
-# takes almost half as long again to run: the right choice where most time goes into compilation. To test what users run:
-# `XLA_FLAGS= python -m pytest`.
+# takes almost half as long again to run: the right choice where most time goes into compilation. `XLA_FLAGS= python -m
+# pytest` tests what users run.
 SOONER_COMPILED = (
     "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1 --xla_cpu_prefer_vector_width=128"
     " --xla_backend_extra_options=xla_cpu_optimize_for_size"
