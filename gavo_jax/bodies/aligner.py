@@ -308,11 +308,10 @@ class BodyAware:
             if gain < GAIN:
                 break
         judged = _judged(best, tried, known)
-        if best.attempt.usable or not judged.usable:
+        if best.attempt.usable:
             return judged
-        return checked_for_periods(
-            self.search, tracker, judged, frame, clock
-        )  # what the search refused it did not check
+        # the search did not check what it refused
+        return checked_for_periods(self.search, tracker, judged, frame, clock)
 
     def _helped_by_prediction(self, state: AwareState, clock: Clock, attempt: Attempt, covered: float) -> Attempt:
         """Help out an attempt that failed beside bodies with the predicted motion.

@@ -101,7 +101,8 @@ def _timed(truth: Trajectory, place: Path, frames: list[float], counted: Counted
     readings = [np.array(in_seconds(stamps.tolist(), counted_in(truth)))]
     if _are_whole(truth) and counted:
         of_frames = counted.seconds(stamps + _behind(stamps, place, np.array(counted.numbers)))
-        readings[1 if known else 0 : 0] = [of_frames] if np.isfinite(of_frames).any() else []
+        if np.isfinite(of_frames).any():
+            readings.insert(1 if known else 0, of_frames)
     if not known:
         readings += [unit * stamps for unit in (*UNITS[1:], TICK)]
     low, high = min(frames), max(frames)

@@ -308,7 +308,7 @@ class Odometry:
         after, result, lost = self._advance(before, frame, finding, attempt)
         after = after._replace(leap=leap if after.held else None, arrival=kept if after.held else renewed)
         size = (self.camera.height, self.camera.width)
-        since = None if lost or not attempt.is_found else before.world_T_reference
+        since = before.world_T_reference if attempt.is_found else None
         bodies = tuple(in_world(seen, after.world_T_camera, since, size) for seen in attempt.bodies)
         revises = attempt.revises
         if not lost:

@@ -20,10 +20,6 @@ class SeenImages:
     def __init__(self, files: Sequence[Sequence[Path]] = ()) -> None:
         self._files, self._count, self._sha256 = files, 0, hashlib.sha256()
 
-    def all(self) -> str:
-        """Return the digest of the images of all frames."""
-        return self.up_to(len(self._files) - 1)
-
     def up_to(self, index: int) -> str:
         """Add the frames up to an index, and return the digest of all so far."""
         for paths in self._files[self._count : index + 1]:

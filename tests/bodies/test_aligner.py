@@ -204,11 +204,8 @@ def test_an_excused_motion_may_still_be_off_by_a_period(monkeypatch: pytest.Monk
     monkeypatch.setattr("gavo_jax.odometry.aligners.another_period_fits_expected", lambda *_: repeats)
     result = no_alignment(AlignmentStatus.HIGH_ERROR)
     result = result._replace(explained=result.explained._replace(grey=np.float32(0.8), depth=np.float32(0.9)))
-    refused, image, covered = (
-        Attempt(None, result, usable=False),
-        jnp.zeros((8, 10)),
-        jnp.zeros((8, 10)).at[:, :4].set(1),
-    )
+    refused = Attempt(None, result, usable=False)
+    image, covered = jnp.zeros((8, 10)), jnp.zeros((8, 10)).at[:, :4].set(1)
     shares = jnp.float32(0.8), jnp.float32(0.05), covered > 0
     belief = Belief(2 * covered - 1, image, *shares, image, image, jnp.ones(2))
     search: Any = SimpleNamespace(align=lambda *_: refused, predict=lambda *_: np.eye(4), camera=CAMERA)
