@@ -264,7 +264,10 @@ def _run_contender(sequence: Sequence, contender: Contender, seed: int | None, p
 
 
 def _typical_runs(entries: list[Entry]) -> list[Entry]:
-    """Return each contender's run of median drift, in order; of two middle runs, the better."""
+    """Return each contender's run of median drift, in order; of two middle runs, the better.
+
+    A run without a drift, of a camera that was lost, is worse than any with one.
+    """
     by_label: dict[str, list[Entry]] = {}
     for entry in entries:
         by_label.setdefault(entry.label, []).append(entry)
@@ -272,10 +275,8 @@ def _typical_runs(entries: list[Entry]) -> list[Entry]:
 
 
 def _median(runs: list[Entry]) -> Entry:
-    drifts = [run.metrics[DRIFT] for run in runs]
-    if None in drifts:
-        return runs[0]
-    return sorted(runs, key=lambda run: run.metrics[DRIFT])[(len(runs) - 1) // 2]
+    drifts = [np.inf if run.metrics[DRIFT] is None else run.metrics[DRIFT] for run in runs]
+    return runs[np.argsort(drifts, kind="stable")[(len(runs) - 1) // 2]]
 
 
 def _drifts(entries: list[Entry]) -> dict[str, Float[np.ndarray, "runs 2"]]:

@@ -773,6 +773,15 @@ def test_an_interrupted_comparison_says_so(gavo, pristine, tmp_path, monkeypatch
     assert "interrupted: 1 of 3 runs were done" in (tmp_path / "out" / "report.html").read_text()
 
 
+@pytest.mark.parametrize(
+    ("drifts", "typical"), [((0.1, None, 0.3), 2), ((0.2, None, None), 1), ((None, 0.2), 1), ((None, None), 0)]
+)
+def test_a_lost_run_is_worse_than_any_other(drifts, typical):
+    """With one lost run, the first seed stood in the table, though another was in the middle."""
+    runs = [compare.Entry("ga", {compare.DRIFT: drift}, seed) for seed, drift in enumerate(drifts)]
+    assert compare._typical_runs(runs) == [runs[typical]]
+
+
 def test_results_of_two_kinds_do_not_share_a_folder(gavo, pristine, tmp_path):
     """Figures have the same names: a comparison replaced a finished run's, and a run a comparison's."""
     for name, file in (("run", "frames.csv"), ("both", "comparison.json")):
