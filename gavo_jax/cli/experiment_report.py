@@ -129,7 +129,7 @@ def _notes(
     rows: Sequence[Mapping[str, Any]], others: Sequence[Mapping[str, Any]], summaries: Sequence[Summary]
 ) -> list[str]:
     """Return notes on the tables; `others` are rows of runs that are not in the experiment's current plan."""
-    notes = _without_drift(summaries)
+    notes = _without_drift(summaries) + _ended(rows)
     if (states := len({_state(row) for row in rows})) > 1:
         notes.append(f"The rows come from {states} versions of the software or its dependencies.")
     if others:
@@ -153,6 +153,20 @@ def _without_drift(summaries: Sequence[Summary]) -> list[str]:
     ]
     notes += [f"No drift of {', '.join(short)}: no two frames that the truth covers are 1 s apart."] if short else []
     return notes + ([f"No errors of {', '.join(blind)}: no ground truth covers it."] if blind else [])
+
+
+def _ended(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return sentences that say which runs `on_lost` ended: their errors are of the frames before."""
+    groups: dict[tuple[str, str], list[bool]] = {}
+    for row in rows:
+        planned = json.loads(row["configuration"]).get("sequence", {}).get("frames", 0)
+        groups.setdefault((row["sequence"], row["label"]), []).append(row["frames"] < planned)
+    return [
+        f"{sum(ended)} of {counted(len(ended), 'run')} of {label} on {name} ended at the first lost pair: figures of "
+        "the frames before."
+        for (name, label), ended in groups.items()
+        if any(ended)
+    ]
 
 
 def _state(row: Mapping[str, Any]) -> tuple[Any, ...]:

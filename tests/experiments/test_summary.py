@@ -1,11 +1,12 @@
 """Medians, spreads and tests from rows whose answers are known."""
 
+import json
 from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
-from gavo_jax.cli.experiment_report import _without_drift
+from gavo_jax.cli.experiment_report import _ended, _without_drift
 from gavo_jax.experiments.summary import ALL, compare, summarise
 
 
@@ -32,6 +33,15 @@ def test_median_and_quartiles():
     assert (found.runs, found.lost, found.together) == (5, 4, 4) and found.milliseconds == pytest.approx(1e3 / 150)
     (unknown,) = summarise(rows("a", "ga", [None, None]))
     assert unknown.drift is None and unknown.rotation is None and unknown.per_frame == pytest.approx(0.0015)
+
+
+def test_runs_that_ended_early_are_told():
+    """Their figures, of the frames before the first lost pair, stood beside those of whole runs without a word."""
+    planned = json.dumps({"sequence": {"frames": 90}})
+    table = [row | {"frames": 90, "configuration": planned} for row in rows("desk", "ga", [0.01, 0.02])]
+    assert _ended(table) == []
+    table[1]["frames"] = 12
+    assert _ended(table) == ["1 of 2 runs of ga on desk ended at the first lost pair: figures of the frames before."]
 
 
 def test_a_method_that_got_lost_does_not_speak_for_the_sequence():
