@@ -15,7 +15,7 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
-from gavo_jax.datasets.depth_unit import DEPTH_RANGE, PLAUSIBLE
+from gavo_jax.datasets.depth_unit import PLAUSIBLE, is_unusual
 from gavo_jax.status import AlignmentStatus
 
 
@@ -189,7 +189,7 @@ def doubts_last_stamp(timestamp: float, history: History) -> bool:
 def check_images(grey: np.ndarray, depth: np.ndarray, depth_scale: float) -> tuple[AlignmentStatus, ...]:
     """Return the faults of an image [H, W] and its depth by themselves, without earlier frames.
 
-    A single scene may be nearer than `DEPTH_RANGE`, which the checks of a run report.
+    A single scene may be unusually near, which the checks of a run report.
     """
     depths = some_of(depth)
     status, _ = _check_image(np.asarray(grey)[::ROW_STEP])
@@ -305,7 +305,7 @@ def _check_depth(depth: np.ndarray, depth_scale: float, history: History) -> tup
         limit = math.log(MAX_RANGE_RATIO) * max(age / RANGE_AGE, 1.0)
         if np.all(changes > limit) or np.all(changes < -limit):
             return _refused(AlignmentStatus.DEPTH_UNITS), history
-    likely = bool(DEPTH_RANGE[0] < ranges[1] < DEPTH_RANGE[1])
+    likely = not is_unusual(float(ranges[1]), float(readings.max()) / depth_scale, depth_scale)
     known = history.units_known or (likely and bool(ranges[-1] > MIN_FAR))
     stamp = history.timestamp or 0.0
     history = history._replace(ranges=tuple(ranges.tolist()), range_timestamp=stamp, units_known=known)

@@ -95,6 +95,30 @@ def test_depth_in_other_units_throughout_is_told_but_used(frames):
     assert findings == [Finding(Status.DEPTH_UNITS, Use.ALL)] * len(frames)
 
 
+@pytest.mark.parametrize(
+    ("scale", "metres", "is_told"),
+    [
+        (1000, 0.25, False),
+        (1000, 0.1, True),
+        (5000, 0.25, True),
+        (1, 0.25, True),
+        (1, 25.0, False),
+        (5000, 12.0, False),
+    ],
+)
+def test_a_near_scene_is_doubted_only_where_another_unit_would_explain_it(frames, scale, metres, is_told):
+    """All frames of a wrist's camera, 0.25 m from what it sees, were `depth_units` though in millimetres."""
+    camera = replace(CAMERA, depth_scale=float(scale))
+    median = float(np.median(frames[0].depth[frames[0].depth > 0]))
+    dtype = np.float32 if scale == 1 else np.uint16
+    near = [replace(frame, depth=(frame.depth * (metres * scale / median)).astype(dtype)) for frame in frames[:3]]
+    status = Status.DEPTH_UNITS if is_told else Status.OK
+    history = History()
+    for frame in near:
+        finding, history = check_frame(frame, frame.timestamp, camera, history)
+        assert finding == Finding(status, Use.ALL)
+
+
 def test_a_near_body_does_not_change_the_units(frames, seen):
     def behind_a_body(frame: Frame) -> Frame:
         depth = frame.depth.copy()

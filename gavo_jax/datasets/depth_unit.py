@@ -168,6 +168,31 @@ def fault_of_scale(sequence: FrameSequence, depths: list[np.ndarray] | None = No
     return None
 
 
+def is_unusual(median: float, farthest: float, scale: float) -> bool:
+    """Whether depth may be in other units: its median is unusual, and usual in another common unit.
+
+    Cameras for short distances, as on a robot's wrist, see scenes of 0.2 m. In millimetres those are taken to be right:
+    in no other common unit would they be usual.
+
+    Args:
+        median: Median depth, metres.
+        farthest: Largest depth, metres.
+        scale: Units per metre.
+    """
+    if DEPTH_RANGE[0] < median < DEPTH_RANGE[1]:
+        return False
+    return (
+        not PLAUSIBLE[0] < median < PLAUSIBLE[1]
+        or any(USUAL[0] < median * scale / unit < USUAL[1] for unit in COMMON if unit != scale)
+        or _may_be_shares(farthest, scale)
+    )
+
+
+def _may_be_shares(farthest: float, scale: float) -> bool:
+    """Whether floats may be shares of a greatest distance."""
+    return farthest <= 1 and scale == 1
+
+
 def _in_another_unit(sample: DepthSample, scale: float) -> str:
     """What the median depth is in another unit that makes it usual; empty if none does."""
     others = [unit for unit in COMMON if unit != scale and sample.median / unit < USUAL[1]]
@@ -204,7 +229,7 @@ def _as_halves(sample: DepthSample) -> str:
 
 def _as_shares(sample: DepthSample, scale: float) -> str:
     """What depth is if floats are shares of a greatest distance, as simulators have it; empty where they cannot be."""
-    if sample.is_whole or sample.far > 1 or scale != 1:
+    if sample.is_whole or not _may_be_shares(sample.far, scale):
         return ""
     return "; floats up to 1 may be fractions of a largest distance: pass --depth-scale 0.1 if 1 stands for 10 m"
 
