@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from gavo_jax.errors import GavoError, as_number
 from gavo_jax.trajectory import (
     MAX_GAP,
+    ROUNDED,
     Trajectory,
     associate,
     inverse,
@@ -234,7 +235,8 @@ def _relative_pose_error_seconds(estimate: Trajectory, truth: Trajectory, delta:
     nearest = _closest_index(truth.timestamps, estimate.timestamps)
     estimate = _in_segments_of_both(estimate, truth.segments[nearest])
     interval = np.median(np.diff(truth.timestamps))
-    farthest = 2 * interval if interval <= SPARSE else MAX_DIFFERENCE
+    is_sparse = interval > ROUNDED * SPARSE
+    farthest = MAX_DIFFERENCE if is_sparse else 2 * interval
     far = np.abs(truth.timestamps[nearest] - estimate.timestamps) > farthest
     covered = ~far[start] & ~far[end] & (estimate.segments[start] == estimate.segments[end])
     start, end = start[covered], end[covered]
@@ -243,7 +245,7 @@ def _relative_pose_error_seconds(estimate: Trajectory, truth: Trajectory, delta:
     estimated, true = estimate.world_T_camera, truth.world_T_camera[nearest]
     end_T_start = inverse(estimated[end]) @ estimated[start]
     true_end_T_start = inverse(true[end]) @ true[start]
-    reach = "" if interval <= SPARSE else f" within {MAX_DIFFERENCE:g} s"
+    reach = "" if not is_sparse else f" within {MAX_DIFFERENCE:g} s"
     definition = f"inv(est_j_T_i) @ true_j_T_i over {delta:g} s (TUM evaluate_rpe.py, fixed delta), nearest true stamps"
     definition += reach
     error = inverse(end_T_start) @ true_end_T_start

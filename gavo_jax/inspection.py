@@ -11,6 +11,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.depth_doubts import doubt_of_depth, fault_of_depth
 from gavo_jax.datasets.depth_unit import name_of_unit
+from gavo_jax.datasets.rectified import rectified_at
 from gavo_jax.depth_edges import DepthEdges
 from gavo_jax.frame_checks import MAX_INTERVAL_RATIO, History, Use, check_frame, some_of
 from gavo_jax.status import AlignmentStatus
@@ -100,7 +101,7 @@ def _look(sequence: Sequence, on_frame: Callable[[], None]) -> Facts:
     used, contrast, doubted, edges = 0, [], Counter(), DepthEdges.none()
     for index, timestamp in enumerate(sequence.timestamps):
         try:
-            frame: Frame | FrameError = sequence[index]
+            frame: Frame | FrameError = rectified_at(sequence, index)
         except FrameError as error:
             frame = error
             reasons.append(str(error))

@@ -76,6 +76,18 @@ class EveryOtherRow:
         return self.frames[index]
 
 
+def test_an_inspection_sees_what_a_run_does(frames: list[Frame]) -> None:
+    """65535 was a surface at 13 m, and an image in colour a traceback."""
+    sequence: Any = EveryOtherRow(frames)
+    sequence.frames = [
+        replace(f, depth=np.where(f.depth > 0, f.depth, 65535).astype(np.uint16)) for f in sequence.frames
+    ]
+    sequence.frames[2] = replace(sequence.frames[2], grey=np.stack([sequence.frames[2].grey] * 3, axis=-1))
+    facts = inspect_sequence(sequence)
+    assert facts["depth"]["far_m"] < 13 and facts["depth"]["coverage"] < 0.52
+    assert facts["frames_not_used"] == {"unreadable": 1} and "grey image" in facts["why_not"][0]
+
+
 def test_an_inspection_finds_them(frames: list[Frame]) -> None:
     sequence: Any = EveryOtherRow(frames)
     depth = inspect_sequence(sequence)["depth"]

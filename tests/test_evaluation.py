@@ -101,6 +101,17 @@ def test_sparse_truth_is_compared_only_where_it_is(rate):
         relative_pose_error(dense[6::12], dense[::120])
 
 
+@pytest.mark.parametrize("start", [0.0, 1000.0, 1e6])
+def test_the_clock_does_not_decide_whether_a_truth_is_sparse(start):
+    """One of 25 Hz lay on the limit, to which its stamps' rounding added: other pairs, and another drift."""
+    truth = smooth_truth(rate=25.0)
+    moved = Trajectory(truth.timestamps - truth.timestamps[0] + start, truth.world_T_camera)
+    without = np.arange(len(truth)) != 40
+    found = relative_pose_error(moved, moved[without]).translation
+    assert found.values.size == relative_pose_error(truth, truth[without]).translation.values.size
+    assert found.rmse > 0, "within two intervals, as by TUM's script"
+
+
 @pytest.mark.parametrize("apart", [2.1, 2.5, 30.0])
 def test_poses_that_lie_far_apart_have_no_drift_a_second(apart):
     """The pose nearest to one second later was the same one: the drift was 0."""

@@ -26,6 +26,8 @@ SPACING = 1 / 80
 """Smallest distance of two corners, as a share of the image's width."""
 WINDOW = 1 / 30
 """Side of the window that is tracked about a corner, as a share of the width."""
+LEAST_WINDOW = 3
+"""Smallest side in pixels, for small images."""
 RETURN = 0.5
 """Largest distance between a corner and where tracking back ends, pixels."""
 NEAREST = 0.05
@@ -57,7 +59,7 @@ def track_corners(
     """
     grey, depth, target = grey_bytes(reference[0]), reference[1], grey_bytes(target)
     column, row, seen = _view(depth, target_T_reference, camera)
-    size = 2 * int(0.5 * WINDOW * camera.width) + 1
+    size = max(LEAST_WINDOW, 2 * int(0.5 * WINDOW * camera.width) + 1)
     seen = cv2.erode(seen, np.ones((size, size), np.uint8)) * (depth > 0)
     points = None
     is_corner = seen * (cv2.cornerMinEigenVal(grey, 3) > RESPONSE * LEAST_SLOPE**2).astype(np.uint8)

@@ -274,7 +274,9 @@ def find_against(
     motion, model, explained = examination.motion, examination.model, examination.explained
     deviation = jnp.sqrt(jnp.maximum(jnp.diag(covariance), 0.0))
     has_reading = objective.reference.points.q > 0
-    finite = jnp.isfinite(model.error) & jnp.all(jnp.isfinite(motion)) & jnp.all(jnp.isfinite(covariance))
+    out_of_view = objective.is_out_of_view(model.overlap)  # E is infinite by definition
+    has_error = jnp.isfinite(model.error) | (out_of_view & ~jnp.isnan(model.error))
+    finite = has_error & jnp.all(jnp.isfinite(motion)) & jnp.all(jnp.isfinite(covariance))
     wide = (jnp.max(deviation[:3]) > MAX_TRANSLATION_DEVIATION) | (jnp.max(deviation[3:]) > MAX_ROTATION_DEVIATION)
     doubtful = jnp.max(deviation) > DOUBTFUL_DEVIATION
     unexplained = (explained.grey < MIN_EXPLAINED_GREY) | (doubtful & (explained.depth < MIN_EXPLAINED_DEPTH))
@@ -285,7 +287,7 @@ def find_against(
         AlignmentStatus.AMBIGUOUS: rival < MAX_RIVAL,
         AlignmentStatus.LOW_TEXTURE: wide | (contrast < MIN_CONTRAST) | ~jnp.all(examination.information.determined),
         AlignmentStatus.HIGH_ERROR: unexplained,
-        AlignmentStatus.LOW_OVERLAP: model.overlap < MIN_FINAL_OVERLAP,
+        AlignmentStatus.LOW_OVERLAP: out_of_view | (model.overlap < MIN_FINAL_OVERLAP),
         AlignmentStatus.NOT_FINITE: ~finite,
         AlignmentStatus.NO_DEPTH: jnp.sum(has_reading) < MIN_DEPTH_SHARE * points,
         AlignmentStatus.NOT_RIGID: departure_from_rigid(motion) > MAX_DEPARTURE,

@@ -113,11 +113,15 @@ def stacked_images(side: Any, camera: Camera) -> Images:
     require_camera(camera)
     if not hasattr(side, "__len__"):
         raise GavoError(f"expected lists of frames or pairs of arrays, got {type(side).__name__}")
+    if isinstance(side, tuple) and len(side) == 2 and all(isinstance(part, list) for part in side):
+        raise GavoError("a tuple of two lists: expected a list of pairs (grey, depth), or stack each with np.stack")
     is_stacked = isinstance(side, tuple) and len(side) == 2 and not isinstance(side[0], tuple) and np.ndim(side[0]) == 3
     if not len(side[0] if is_stacked else side):
         raise GavoError("a batch of no frames: expected at least one pair")
     if is_stacked:
         side = tuple(map(_plain, side))
+        if len(side[0]) != len(side[1]):
+            raise GavoError(f"{len(side[0])} grey images but {len(side[1])} of depth")
         if not camera.is_rectified:
             return stacked_images(list(zip(*side, strict=True)), camera)
         for name, images in zip(("grey", "depth"), side, strict=True):

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from gavo_jax.calibration.vignetting import Blocks, corner_darkness, fit_vignetting, seen_twice
 from gavo_jax.camera import inverse_depth
 from gavo_jax.datasets.base import FrameError, Sequence
-from gavo_jax.datasets.rectified import without_distortion
+from gavo_jax.datasets.rectified import rectified_at, without_distortion
 from gavo_jax.trajectory import Trajectory
 
 PAIRS, APART = 24, 8
@@ -45,7 +45,7 @@ def darkness_of(sequence: Sequence, trajectory: Trajectory) -> Darkness | None:
 
     @cache  # the pairs of a short run share frames
     def blocks(place: int) -> Blocks:
-        frame = sequence[place]
+        frame = rectified_at(sequence, place)
         return Blocks.of(frame.grey, inverse_depth(frame.depth, camera), camera)
 
     pairs = []

@@ -21,7 +21,14 @@ from jaxtyping import Integer
 from gavo_jax.calibration.motion import LEAST_FRAMES, stretches_of_motion
 from gavo_jax.calibration.pairs import Kinematics, Matched, Stretch, Unknowns, match_pairs
 from gavo_jax.calibration.scan import Minimum, Score, coarse, refine
-from gavo_jax.calibration.vignetting import Blocks, corner_darkness, fit_vignetting, lens_vignetting, seen_twice
+from gavo_jax.calibration.vignetting import (
+    Blocks,
+    corner_darkness,
+    fit_vignetting,
+    lens_vignetting,
+    seen_twice,
+    together,
+)
 from gavo_jax.camera import Camera
 from gavo_jax.compilation.precision import in_32_bits
 from gavo_jax.datasets.base import Sequence
@@ -167,7 +174,7 @@ def estimate_camera(
         GavoError: unknown parameter, too few readable frames, or too few pairs that can be aligned.
     """
     guessed = getattr(sequence, "times_guessed", "")
-    sequence = without_distortion(sequence)
+    given, sequence = sequence, without_distortion(sequence)
     wanted, camera = tuple(wanted), sequence.camera
     if unknown := set(wanted) - {"depth_scale", *_STAGES}:
         raise GavoError(f"wanted: unknown {', '.join(sorted(unknown))}: not one of depth_scale, {', '.join(_STAGES)}")
@@ -175,7 +182,7 @@ def estimate_camera(
     if "depth_scale" in wanted:
         found["depth_scale"] = _depth_scale(sequence)
     if found.keys() == set(wanted):
-        return CameraEstimate(found, _with_found(sequence, found), 0.0, 0)
+        return CameraEstimate(found, _with_found(given, found), 0.0, 0)
     on_progress("looking for stretches of motion")
     stretches = [Stretch.of(frames, camera) for frames in stretches_of_motion(sequence)]
     unknowns = Unknowns.of(camera)
@@ -200,7 +207,7 @@ def estimate_camera(
                 trial.settle()
     found |= _judged(minima, trial, interval, guessed)
     delay = found["depth_delay"].value if "depth_delay" in found else None
-    return CameraEstimate(found, _with_found(sequence, found), delay or 0.0, pairs)
+    return CameraEstimate(found, _with_found(given, found), delay or 0.0, pairs)
 
 
 def _find_readout(trial: _Trial, interval: float, is_first: bool) -> dict[str, Minimum]:
@@ -346,7 +353,7 @@ def _with_found(sequence: Sequence, found: dict[str, Found]) -> Camera:
     values = {name: found[name].value for name in names if name in found}
     known: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
     if "vignetting" in known:
-        known["vignetting"] = lens_vignetting(known["vignetting"])
+        known["vignetting"] = together(camera.vignetting, lens_vignetting(known["vignetting"]))
     if "depth_scale" in known and unit is not None:
         known["depth_scale"] *= unit.frame / unit.file
     return replace(camera, **known)

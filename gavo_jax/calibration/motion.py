@@ -3,6 +3,7 @@
 import numpy as np
 
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
+from gavo_jax.datasets.rectified import rectified_at
 from gavo_jax.errors import GavoError
 
 WINDOW = 45
@@ -47,7 +48,7 @@ def _changes(sequence: Sequence, count: int) -> np.ndarray:
     changes, before = np.zeros(count - 1), None
     for index in range(count):
         try:
-            grey = np.asarray(sequence[index].grey)[::8, ::8].astype(np.float32)
+            grey = np.asarray(rectified_at(sequence, index).grey)[::8, ::8].astype(np.float32)
         except FrameError:
             before = None
             continue
@@ -62,7 +63,7 @@ def _readable(sequence: Sequence, start: int, length: int) -> list[Frame]:
     runs: list[list[Frame]] = [[]]
     for index in range(start, start + length):
         try:
-            frame = sequence[index]
+            frame = rectified_at(sequence, index)
         except FrameError:
             runs.append([])
             continue

@@ -75,7 +75,7 @@ class Stretch(NamedTuple):
         for frame in frames:
             levels.append(_half(frame.grey, frame.depth, camera.depth_scale))
             stamps.append(frame.timestamp)
-            depth_stamps.append(frame.timestamp if frame.depth_timestamp is None else frame.depth_timestamp)
+            depth_stamps.append(frame.timestamp + frame.depth_delay)
         grey, inverse_depth = (jnp.stack(images) for images in zip(*levels, strict=True))
         start = stamps[0]
         colour, depth = evened(np.array(stamps) - start), evened(np.array(depth_stamps) - start)

@@ -126,6 +126,12 @@ def corner_darkness(amount: float, camera: Camera) -> float:
     return 1 - (1 + amount * (x**2 + y**2)) ** -2
 
 
+def together(first: tuple[float, ...], second: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the coefficients of two vignettings, one undone after the other."""
+    product = np.polynomial.polynomial.polymul([1.0, *first], [1.0, *second])
+    return tuple(float(value) for value in product[1:])
+
+
 def lens_vignetting(amount: float) -> tuple[float, ...]:
     """Return a as coefficients of `Camera.vignetting`; none for 0."""
     return (2 * amount, amount**2) if amount else ()

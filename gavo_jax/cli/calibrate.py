@@ -5,11 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gavo_jax.calibration.estimate import ALWAYS, CameraEstimate, Found, Wanted, estimate_camera
 from gavo_jax.calibration.file import write_camera_file
-from gavo_jax.calibration.vignetting import lens_vignetting
+from gavo_jax.calibration.vignetting import lens_vignetting, together
 from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.camera_files.words import FOCAL
 from gavo_jax.cli.options import Calibrate
@@ -71,12 +69,6 @@ def calibration_of(sequence: Sequence, estimate: CameraEstimate) -> Calibration:
     lens = replace(sequence.camera, **values).scaled(before.color.width // sequence.camera.width)
     values |= {name: value for name, value in zip(FOCAL, lens, strict=True) if name in values}
     return replace(before.with_color(replace(before.color, **values)), depth_delay=delay)
-
-
-def together(first: tuple[float, ...], second: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the coefficients of two vignettings, one undone after the other."""
-    product = np.polynomial.polynomial.polymul([1.0, *first], [1.0, *second])
-    return tuple(float(value) for value in product[1:])
 
 
 def with_total_delay(found: dict[str, Found], depth_delay: float) -> dict[str, Found]:

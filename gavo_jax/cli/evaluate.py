@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gavo_jax.cli.options import Evaluate
+from gavo_jax.cli.run_table import covered_in_part
 from gavo_jax.datasets.clocks import INTERVALS
 from gavo_jax.datasets.truth import counted_in
 from gavo_jax.errors import GavoError, print_message
@@ -22,7 +23,7 @@ from gavo_jax.output import plots
 from gavo_jax.output.drawing import draw
 from gavo_jax.output.files import COMPARISON, FRAMES, prepare_folder, refuse_foreign
 from gavo_jax.output.screen import number, print_table, say, waiting
-from gavo_jax.trajectory import Trajectory, associate
+from gavo_jax.trajectory import MAX_GAP, Trajectory, associate
 from gavo_jax.trajectory_doubts import is_w_first, relative_size
 
 UNITS = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
@@ -71,7 +72,7 @@ def _check(options: Evaluate) -> None:
 
 
 def _remarks(paths: tuple[Path, Path], read: list[tuple[Trajectory, float]]) -> Iterator[str]:
-    """Yield a remark for each file that was not read literally, or disagrees as a whole."""
+    """Yield a remark for each file that was not read literally, or disagrees as a whole, and for a truth in part."""
     for path, (one, unit), (other, _) in zip(paths, read, reversed(read), strict=True):
         if unit in UNITS:
             yield f"{path}: its stamps are taken as {UNITS[unit]}"
@@ -79,6 +80,10 @@ def _remarks(paths: tuple[Path, Path], read: list[tuple[Trajectory, float]]) -> 
             yield f"{path}: its rotations agree only if its quaternions are read as w x y z; write them as x y z w"
     if size := relative_size(read[0][0], read[1][0]):
         yield f"{paths[0]}: it has {size:.3g} times the size of {paths[1]}, and the errors do not allow for that"
+    (estimate, _), (truth, _) = read
+    is_dense = len(truth) > 1 and np.median(np.diff(truth.timestamps)) <= MAX_GAP
+    if is_dense and (part := covered_in_part(estimate, truth)):
+        yield part
 
 
 NAMES = ("rpe_translation", "rpe_rotation", "ate", "distance_error")

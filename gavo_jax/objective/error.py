@@ -218,7 +218,11 @@ class Objective:
         outside = (valid - inside) * self.outside_cost * typical
         overlap = inside / valid
         error = self.scales.grey**2 * (total + outside) / self.divisor(inside)
-        return jnp.where(overlap < self.min_overlap, jnp.inf, error), overlap
+        return jnp.where(self.is_out_of_view(overlap), jnp.inf, error), overlap
+
+    def is_out_of_view(self, overlap: Float[Array, "*p"]) -> Bool[Array, "*p"]:
+        """Whether too few points are in view for a motion to count; without any, even where none is required."""
+        return (overlap < self.min_overlap) | (overlap <= 0)
 
     def divisor(self, inside: Float[Array, "*p"]) -> Float[Array, "*p"]:
         """Number of points that E is the mean over."""

@@ -39,7 +39,7 @@ class Problem:
     which a candidate is invalid. None: only the solver's bounds limit the search."""
     reach: Float[Array, " 2"] | None = None
     searched: Bool[Array, ""] | bool = True
-    """Whether to search at all; if not, every candidate is invalid and none costs anything."""
+    """Whether to search at all; if not, every candidate of a population is invalid and none costs anything."""
 
     def with_sway(self, twist: Float[Array, " 6"]) -> "Problem":
         """Return the problem with a sway of the target; see `alignment.sway`."""

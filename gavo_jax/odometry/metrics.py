@@ -36,7 +36,8 @@ class Metrics(TypedDict):
     ate_translation_rmse_m: float | None
     """Absolute trajectory error, after alignment."""
     distance_error_final_m: float | None
-    """Position error of the last pose, from a common first pose; None where the motion in between is unknown."""
+    """Position error of the last pose that the truth covers, from a common first pose; None where the motion in between
+    is unknown."""
     compile_seconds: float
     milliseconds_per_pair_median: float | None
     frames_per_second: float | None

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gavo_jax.alignment.corners import track_corners
 from gavo_jax.alignment.own_motion import refine_moving, with_own_motion
 from gavo_jax.alignment.result import no_alignment, on_host
 from gavo_jax.camera import Camera
@@ -77,3 +78,11 @@ def test_corners_decide_whether_a_motion_is_determined() -> None:
     assert AlignmentStatus.LOW_TEXTURE in on_host(impossible).statuses, "a variance that is none tells nothing"
     vague = with_own_motion(result, found._replace(covariance=100.0 * found.covariance))
     assert vague.status == AlignmentStatus.LOW_OVERLAP and vague.findings == findings
+
+
+def test_a_small_image_has_corners_too() -> None:
+    """Below 60 pixels of width the window was a single pixel, which ended the program within OpenCV."""
+    texture = (255 * np.random.default_rng(0).uniform(0, 1, (12, 12))).astype(np.uint8).repeat(4, 0).repeat(4, 1)
+    camera = Camera(45.0, 45.0, 23.5, 23.5, 48, 48, depth_scale=1000.0, readout=0.02)
+    frame = texture, np.full((48, 48), 2000, np.uint16)
+    assert len(track_corners(frame, texture, np.eye(4), camera).reference) > 5

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from aligning import Images, difference, run, target_T_reference
@@ -76,6 +77,21 @@ def test_nothing_but_numbers_comes_out_of_nothing(sequence: SyntheticSequence, f
     result = run("gauss-newton", blind(black(frames[0])), blind(black(frames[1])), sequence.camera)
     assert np.isfinite(result.target_T_reference).all()
     assert result.status is not AlignmentStatus.OK
+
+
+@pytest.mark.parametrize(("share", "is_low"), [(0.2, True), (0.37, True), (0.6, False)])
+def test_a_small_overlap_is_told_as_such(share: float, is_low: bool) -> None:
+    """It was `not_finite`, as the error of a motion with too few points in view is infinite by definition."""
+    texture = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 1, (120, 400)), (0, 0), 2.0)
+    texture = (255 * (texture - texture.min()) / np.ptp(texture)).astype(np.uint8)
+    depth, shift = np.full((120, 160), 2 * CAMERA.depth_scale, np.uint16), round((1 - share) * 160)
+    guess = np.eye(4)
+    guess[0, 3] = -shift * 2 / CAMERA.fx
+    wall, farther = ((texture[:, at : at + 160], depth) for at in (0, shift))
+    result = align(wall, farther, CAMERA, NEWTON, guess=guess)
+    assert share - 0.07 < result.overlap < share
+    assert (result.status is AlignmentStatus.LOW_OVERLAP) == is_low
+    assert AlignmentStatus.NOT_FINITE not in result.statuses
 
 
 def grey_of(value: int) -> Callable[[Images], Images]:

@@ -31,6 +31,16 @@ def test_depth_that_is_no_number_is_no_reading_however_it_comes(put: Any) -> Non
         assert not cleaned[0, :2].any() and (cleaned[0, 2:] == 1).all() and (cleaned[1] == 1).all()
 
 
+def test_two_lists_are_no_stacks() -> None:
+    """Two pairs as a tuple of lists were read as a stack of grey and a stack of depth."""
+    grey, depth = np.zeros((2, 120, 160), np.float32), np.ones((2, 120, 160), np.float32)
+    for side in (([grey[0], depth[0]], [grey[1], depth[1]]), (list(grey), list(depth))):
+        with pytest.raises(GavoError, match="a tuple of two lists"):
+            stacked_images(side, CAMERA)
+    with pytest.raises(GavoError, match="2 grey images but 1 of depth"):
+        stacked_images((grey, depth[:1]), replace(CAMERA, distortion=(0.1, 0.0, 0.0, 0.0, 0.0)))
+
+
 def test_what_is_no_frame_is_refused_by_name(small_frames: dict[int, Frame]) -> None:
     frame = small_frames[0]
     with pytest.raises(GavoError, match="pair \\(grey, depth\\), got ndarray"):

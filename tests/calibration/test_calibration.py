@@ -12,7 +12,7 @@ from small import CAMERA
 from gavo_jax.calibration import estimate as estimate_module
 from gavo_jax.calibration.estimate import Found, Wanted, estimate_camera
 from gavo_jax.calibration.file import write_camera_file
-from gavo_jax.calibration.pairs import Kinematics, Matched, Unknowns, depth_moved, evened, smoothed_depth
+from gavo_jax.calibration.pairs import Kinematics, Matched, Stretch, Unknowns, depth_moved, evened, smoothed_depth
 from gavo_jax.calibration.scan import coarse, refine
 from gavo_jax.calibration.vignetting import lens_vignetting
 from gavo_jax.camera import vignetting_gain
@@ -117,6 +117,24 @@ def test_vignetting_adds_to_what_the_camera_says() -> None:
     np.testing.assert_allclose(vignetting_gain(both), gain, rtol=1e-5)
     found["vignetting"] = Found(None, None, "", "")
     assert calibration_of(sequence, estimate).color == known
+
+
+def test_the_estimates_camera_is_of_the_frames_as_given() -> None:
+    """It had lost its lens: used on the same frames, they would not have been rectified."""
+    known = replace(CAMERA, distortion=(0.1, -0.05, 0.0, 0.0, 0.0), vignetting=lens_vignetting(0.5))
+    sequence: Any = SimpleNamespace(camera=known)
+    found = estimate_module._with_found(sequence, {"vignetting": Found(0.2, 0.03, "", "")})
+    gain = vignetting_gain(known) * vignetting_gain(replace(CAMERA, vignetting=lens_vignetting(0.2)))
+    assert found.distortion == known.distortion
+    np.testing.assert_allclose(vignetting_gain(found), gain, rtol=1e-5)
+
+
+def test_depth_of_another_clock_has_no_delay() -> None:
+    """Stamps 1000 s off, which a run takes for those of another clock, left no pair that could be aligned."""
+    shaken = Shaken(4)
+    own = Stretch.of([replace(frame, depth_timestamp=None) for frame in shaken.frames], shaken.camera)
+    other = Stretch.of([replace(f, depth_timestamp=f.timestamp + 1e3) for f in shaken.frames], shaken.camera)
+    np.testing.assert_array_equal(own.delays, other.delays)
 
 
 def test_a_readout_is_no_longer_than_the_time_between_two_frames() -> None:

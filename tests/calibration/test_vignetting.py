@@ -94,6 +94,14 @@ def test_a_run_shows_how_dark_its_corners_are(amount: float) -> None:
     assert found.is_harmful == (amount > 0)
 
 
+def test_a_frame_of_another_size_is_left_out() -> None:
+    """It ended a whole run with a traceback, after its last frame."""
+    sequence: Any = Darkened(0.3)
+    sequence.gain = 1.0
+    sequence.frames[12] = replace(sequence.frames[12], grey=sequence.frames[12].grey[:-8])
+    assert darkness_of(sequence, WALK.ground_truth) is not None  # pyright: ignore[reportArgumentType]
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_a_camera_at_rest_shows_nothing(seed: int) -> None:
     """Noise alone asked for any lens: pairs that share a frame share its noise, and seemed to agree (seed 4)."""

@@ -626,6 +626,17 @@ def test_evaluate_tells_what_can_be_had(gavo, tmp_path):
     assert "distance error: the ground truth" in gavo("evaluate", "estimate.txt", "truth.txt").out
 
 
+def test_evaluate_tells_how_much_the_truth_covers(gavo, tmp_path):
+    """The errors were of a third of the trajectory, which only their number showed."""
+    poses = np.tile(np.eye(4), (91, 1, 1))
+    poses[:, 0, 3] = 0.01 * np.arange(91)
+    stamps = 100.0 + np.arange(91) / 30
+    Trajectory(stamps, poses).write_tum(tmp_path / "estimate.txt")
+    Trajectory(stamps[:46], poses[:46]).write_tum(tmp_path / "truth.txt")
+    assert "The ground truth covers 46 of 91 poses" in gavo("evaluate", "estimate.txt", "truth.txt").out
+    assert "covers" not in gavo("evaluate", "truth.txt", "estimate.txt").out
+
+
 def test_evaluate_as_json_and_figures(gavo, clip, tmp_path):
     truth = clip / "groundtruth.txt"
     done = gavo("evaluate", truth, truth, "--delta", 1, "--unit", "frames", "--json", "--plot", tmp_path / "figures")
