@@ -30,7 +30,7 @@ class Seen(NamedTuple):
     """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Body:
     """A body in one frame, in the world of the run."""
 

@@ -27,16 +27,20 @@ from gavo_jax.odometry.metrics import (
     FRAMES_PER_SECOND,
     MILLISECONDS,
     ROTATION_DRIFT,
+    drifts_of,
     run_identity,
 )
 from gavo_jax.output import plots
 from gavo_jax.output.drawing import draw, save_figure
 from gavo_jax.output.files import (
     COMPARISON,
+    EXPERIMENT,
+    FIGURE_NAMES,
     FRAMES,
     environment,
     prepare_folder,
     refuse_foreign,
+    refuse_strange,
     remove_figures,
     remove_files,
     write_json,
@@ -116,8 +120,11 @@ def compare(options: Compare) -> int:
     folder = prepare_folder(options.output or Path("runs") / f"{sequence.name}-compare-{options.preset}")
     with hold(folder):
         refuse_foreign(folder, FRAMES, "a run")
+        refuse_foreign(folder, EXPERIMENT, "an experiment")
         if (folder / COMPARISON).exists():
             say(f"the earlier comparison in {folder} is replaced")
+        else:
+            refuse_strange(folder, (REPORT, *FIGURE_NAMES, *_earlier_trajectories(folder)), "a comparison")
         remove_files(folder, COMPARISON, REPORT, *_earlier_trajectories(folder))
         remove_figures(folder)
         say(summary(sequence))
@@ -171,6 +178,8 @@ def _write(options: Compare, sequence: Sequence, entries: list[Entry], folder: P
     rows = _rows(entries, typical)
     cost = "rendering" if options.sequence == SYNTHETIC else "reading and decoding"
     _print(title, rows, options.seeds, cost)
+    for line in _without_drift(entries):
+        say(line)
     for entry in typical:
         if reason := why_no_drift(entry.metrics, entry.trajectory, sequence.ground_truth is not None):
             say(reason)
@@ -275,21 +284,28 @@ def _typical_runs(entries: list[Entry]) -> list[Entry]:
 
 
 def _median(runs: list[Entry]) -> Entry:
-    drifts = [np.inf if run.metrics[DRIFT] is None else run.metrics[DRIFT] for run in runs]
+    drifts = [drifts_of(run.metrics)[0] for run in runs]
     return runs[np.argsort(drifts, kind="stable")[(len(runs) - 1) // 2]]
 
 
 def _drifts(entries: list[Entry]) -> dict[str, Float[np.ndarray, "runs 2"]]:
-    """Return the drift in translation (m/s) and rotation (deg/s) of every run, by contender.
-
-    Empty if any run has no drift.
-    """
-    if any(entry.metrics[DRIFT] is None for entry in entries):
-        return {}
-    runs: dict[str, list[list[float]]] = {}
+    """Return the drift in translation (m/s) and rotation (deg/s) of every run, by contender; empty if none has any."""
+    runs: dict[str, list[tuple[float, float]]] = {}
     for entry in entries:
-        runs.setdefault(entry.label, []).append([entry.metrics[DRIFT], entry.metrics[ROTATION_DRIFT]])
-    return {label: np.array(values) for label, values in runs.items()}
+        runs.setdefault(entry.label, []).append(drifts_of(entry.metrics))
+    is_any = any(entry.metrics[DRIFT] is not None for entry in entries)
+    return {label: np.array(values) for label, values in runs.items()} if is_any else {}
+
+
+def _without_drift(entries: list[Entry]) -> list[str]:
+    """Return sentences on the methods of which only some runs have a drift."""
+    drifts = {label: np.isinf(runs[:, 0]) for label, runs in _drifts(entries).items()}
+    return [
+        f"No drift in {np.count_nonzero(lost)} of {len(lost)} runs of {label}, which count as infinite: no tracked "
+        "part lasts 1 s."
+        for label, lost in drifts.items()
+        if 0 < np.count_nonzero(lost) < len(lost)
+    ]
 
 
 def _shown(metrics: dict[str, Any], key: str) -> float | None:
@@ -309,9 +325,9 @@ def _rows(entries: list[Entry], typical: list[Entry]) -> list[list[Any]]:
     rows = []
     for run in typical:
         drifts = [entry.metrics[DRIFT] for entry in entries if entry.label == run.label]
-        known = [drift for drift in drifts if drift is not None]
+        span = [np.inf if drift is None else drift for drift in drifts]
         cells = [number(_shown(run.metrics, key), digits) for _, key, digits in COLUMNS]
-        span = [number(extreme(known, default=None)) for extreme in (min, max)]
+        span = [number(found if (found := extreme(span)) < np.inf else None) for extreme in (min, max)]
         path, end = path_and_end(run.trajectory)
         is_all = run.metrics[DRIFT_PER_FRAME] is None
         of_path = [number(path), end or DASH] if is_all else [DASH] * len(PATH_COLUMNS)

@@ -1,19 +1,29 @@
 """`gavo experiment`: runs an experiment file into a table of results, and reports on that table."""
 
 from contextlib import closing, nullcontext
+from pathlib import Path
 
-from gavo_jax.cli.experiment_report import report, report_held
+from gavo_jax.cli.experiment_report import FIGURE, report, report_held
 from gavo_jax.cli.options import Experiment
 from gavo_jax.cli.readiness import be_ready
 from gavo_jax.errors import GavoError
 from gavo_jax.experiments.executors import LocalExecutor, Outcome, RayExecutor
 from gavo_jax.experiments.plan import Plan, Run, programs
 from gavo_jax.experiments.plan_file import read_plan
-from gavo_jax.experiments.record import write_record
+from gavo_jax.experiments.record import read_record, write_record
 from gavo_jax.experiments.runner import estimate_seconds, fitted_batches, missing, run_experiment
 from gavo_jax.experiments.table import Table
 from gavo_jax.locks import hold
-from gavo_jax.output.files import prepare_folder
+from gavo_jax.output.files import (
+    COMPARISON,
+    EXPERIMENT,
+    FIGURE_NAMES,
+    FRAMES,
+    prepare_folder,
+    refuse_foreign,
+    refuse_strange,
+)
+from gavo_jax.output.report import REPORT as PAGE
 from gavo_jax.output.screen import counted, pair_progress, print_table, say
 
 REPORT = "report"
@@ -37,8 +47,18 @@ def experiment(options: Experiment) -> int:
     be_ready()
     prepare_folder(plan.folder)
     with hold(plan.folder):
+        _refuse_foreign(plan.folder, table)
         _run_missing(plan, table, options.executor)
         return report_held(plan.folder, options.markdown)
+
+
+def _refuse_foreign(folder: Path, table: Table) -> None:
+    """Refuse a folder with other results, or with files that the report would replace and no experiment wrote."""
+    for file, what in ((FRAMES, "a run"), (COMPARISON, "a comparison")):
+        refuse_foreign(folder, file, what)
+    if not (read_record(folder).runs or table.done()):
+        figures = (name for name in FIGURE_NAMES if name.startswith(f"{FIGURE}."))
+        refuse_strange(folder, (EXPERIMENT, PAGE, *figures), "an experiment")
 
 
 def _run_missing(plan: Plan, table: Table, executor_name: str) -> None:

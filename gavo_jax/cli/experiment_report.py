@@ -14,7 +14,7 @@ from gavo_jax.experiments.record import Record, read_record
 from gavo_jax.experiments.summary import Comparison, Summary, compare, summarise
 from gavo_jax.experiments.table import Table
 from gavo_jax.locks import hold
-from gavo_jax.odometry.metrics import DRIFT, ROTATION_DRIFT
+from gavo_jax.odometry.metrics import DRIFT, drifts_of
 from gavo_jax.output import plots
 from gavo_jax.output.drawing import save_figure
 from gavo_jax.output.files import environment, prepare_folder
@@ -198,9 +198,10 @@ def _comparison_row(found: Comparison) -> list[Any]:
 def _figures(folder: Path, rows: Sequence[Mapping[str, Any]]) -> list[Picture]:
     """Draw the drift of every method on every sequence, if matplotlib is installed."""
     clips: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    known = {row["sequence"] for row in rows if row[DRIFT] is not None}
     for row in rows:
-        if row[DRIFT] is not None:
-            clips.setdefault(row["sequence"], {}).setdefault(row["label"], []).append((row[DRIFT], row[ROTATION_DRIFT]))
+        if row["sequence"] in known:
+            clips.setdefault(row["sequence"], {}).setdefault(row["label"], []).append(drifts_of(row))
     if not clips or not plots.available():
         return []
     drifts = {clip: {name: np.array(runs) for name, runs in methods.items()} for clip, methods in clips.items()}

@@ -81,9 +81,9 @@ def _follow(options: Run, device: LiveDevice, settings: Settings, shape: Shape) 
         }
         folder.finish(metrics)
         print_run(name, metrics, folder.path, trajectory, truth=None)
+        write_trajectories(trajectory, folder.path, formats(options.trajectory_format))
         if options.map is not None and scene is not None:
             write_map(scene.finish(shape), options.map)
-        write_trajectories(trajectory, folder.path, formats(options.trajectory_format))
     dropped = f"{newest.dropped} of {newest.received} frames were dropped for newer ones"
     say(f"{dropped}: they came while another was tracked, or programs were compiled")
     if end.fault is not None:

@@ -103,9 +103,9 @@ def run(options: Run) -> int:
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         truth, is_rendered = sequence.ground_truth, options.sequence == SYNTHETIC
         print_run(name, metrics, folder.path, trajectory, truth=truth, is_rendered=is_rendered)
+        write_trajectories(trajectory, folder.path, trajectory_formats)
         if options.map is not None:
             save_map(options.map, sequence, folder, trajectory, shape, options.voxel)
-        write_trajectories(trajectory, folder.path, trajectory_formats)
     for line in _doubts(trajectory, truth, unit_of_file(sequence)) if truth is not None else ():
         say(line)
     if not (interrupted or is_rendered) and (dark := darkness_of(sequence, trajectory)) is not None and dark.is_harmful:

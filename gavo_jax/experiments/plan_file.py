@@ -55,8 +55,7 @@ def read_plan(path: str | Path, output: str | Path | None = None) -> Plan:
     table = read_toml(path)
     refuse_unknown(str(path), table, KEYS)
     name = text_of(f"{path}: name", table.get("name", path.stem))
-    if {"/", "\\"} & set(name):
-        raise GavoError(f"{path}: name: {shown(name)} names the folder of the results, so it cannot have / or \\")
+    refuse_as_folder(f"{path}: name", name)
     parts, skipped = parts_of(path, table)
     default_seeds = seeds_of(f"{path}: seeds", table.get("seeds", [0]))
     methods = tables_of(f"{path}: methods", table.get("methods", []))
@@ -223,6 +222,12 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
     return variants
 
 
+def refuse_as_folder(place: str, name: str) -> None:
+    """Raise GavoError if a name leads out of the folder that results are in."""
+    if {"/", "\\"} & set(name) or name in (".", ".."):
+        raise GavoError(f"{place}: {shown(name)} names the folder of the results, so it cannot be a path")
+
+
 def require_what_loops_need(place: str, settings: Settings) -> None:
     """Raise GavoError if the settings close loops but GTSAM is not installed."""
     try:
@@ -252,4 +257,4 @@ def _ray(path: Path, table: Mapping[str, Any]) -> RayOptions:
 
 
 def _short(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return f"{value:g}" if isinstance(value, float) and float(f"{value:g}") == value else str(value)

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 from gavo_jax.errors import GavoError, read_json_object
 from gavo_jax.experiments.plan import Plan
-from gavo_jax.output.files import write_json
+from gavo_jax.output.files import EXPERIMENT, write_json
 
-FILE = "experiment.json"
+FILE = EXPERIMENT
 
 
 class Record(NamedTuple):

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gavo_jax.odometry.metrics import DRIFT, DRIFT_PER_FRAME, FRAMES_PER_SECOND, ROTATION_DRIFT
+from gavo_jax.odometry.metrics import DRIFT, DRIFT_PER_FRAME, FRAMES_PER_SECOND, drifts_of
 
 ALL = "all sequences"
 
@@ -59,7 +59,7 @@ def summarise(rows: Iterable[Row]) -> list[Summary]:
 
 
 def _summary(sequence: str, label: str, rows: Sequence[Row]) -> Summary:
-    drifts, turns = ([np.inf if row[name] is None else row[name] for row in rows] for name in (DRIFT, ROTATION_DRIFT))
+    drifts, turns = zip(*map(drifts_of, rows), strict=True)
     steps = [row[DRIFT_PER_FRAME] for row in rows if row[DRIFT_PER_FRAME] is not None]
     method = "linear" if np.all(np.isfinite(drifts)) else "higher"  # nothing lies between a number and infinity
     quartiles = np.quantile(drifts, (0.25, 0.5, 0.75), method=method).tolist() if min(drifts) < np.inf else None
@@ -91,8 +91,7 @@ def compare(rows: Sequence[Row], earlier: Collection[str] = ()) -> list[Comparis
     known = {row["sequence"] for row in rows if row[DRIFT] is not None}
     for row in rows:
         if row["sequence"] in known:
-            drift = np.inf if row[DRIFT] is None else row[DRIFT]
-            drifts.setdefault(row["label"], {}).setdefault(row["sequence"], {})[row["seed"]] = drift
+            drifts.setdefault(row["label"], {}).setdefault(row["sequence"], {})[row["seed"]] = drifts_of(row)[0]
     sequences = list(dict.fromkeys(row["sequence"] for row in rows))
     found = []
     for first, second in itertools.combinations(drifts, 2):

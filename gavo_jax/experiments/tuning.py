@@ -16,7 +16,7 @@ from gavo_jax import presets
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.errors import GavoError, line_of, read_toml, shown
 from gavo_jax.experiments.plan import Part, frames_of
-from gavo_jax.experiments.plan_file import parts_of, require_what_loops_need
+from gavo_jax.experiments.plan_file import parts_of, refuse_as_folder, require_what_loops_need
 from gavo_jax.experiments.values import seeds_of, text_of, whole_of
 from gavo_jax.interrupts import interruptible
 from gavo_jax.odometry.metrics import DRIFT, MILLISECONDS
@@ -81,6 +81,7 @@ def read_tuning(path: str | Path, output: str | Path | None = None) -> Tuning:
     table = read_toml(path)
     refuse_unknown(str(path), table, KEYS)
     name = text_of(f"{path}: name", table.get("name", path.stem))
+    refuse_as_folder(f"{path}: name", name)
     parts, skipped = parts_of(path, table)
     method, preset = table.get("method", "ga"), table.get("preset", "default")
     refuse_unknown_method(f"{path}: method", str(method))

@@ -38,7 +38,7 @@ from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Step:
     """The driver's record of one new frame."""
 

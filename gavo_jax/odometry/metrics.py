@@ -75,6 +75,12 @@ def run_identity(sequence: str, method: str | None, preset: str | None, seed: in
     return {"sequence": sequence, "method": method, "preset": preset, "seed": seed}
 
 
+def drifts_of(figures: Mapping[str, Any]) -> tuple[float, float]:
+    """Drift of a run in translation (m/s) and rotation (deg/s); +inf without any, of a camera that was lost."""
+    known = figures[DRIFT] is not None
+    return (figures[DRIFT], figures[ROTATION_DRIFT]) if known else (np.inf, np.inf)
+
+
 def errors_before(causal: Mapping[str, Any]) -> dict[str, Any]:
     """Errors of a trajectory before its correction by loops, under names of their own."""
     return {f"odometry_{name}": causal[name] for name in ERRORS}

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from gavo_jax.scene_map import SceneMap
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OdometryRun:
     """A whole run: `trajectory` (camera to world, first camera = world), a step per pair, and the run's figures."""
 

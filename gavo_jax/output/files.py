@@ -7,7 +7,7 @@ import math
 import platform
 import re
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ BODIES = "bodies.csv"
 MOTIONS = "motions.csv"
 CHECKPOINT = "checkpoint.npz"
 COMPARISON = "comparison.json"
+EXPERIMENT = "experiment.json"
 """File that `gavo compare` writes."""
 RECORDING = "run.rrd"
 """File that `--viewer save` writes."""
@@ -130,6 +131,22 @@ def refuse_foreign(folder: Path, file: str, what: str) -> None:
     """
     if (folder / file).exists():
         raise GavoError(f"{folder}: contains {what} ({file}): choose another folder")
+
+
+def refuse_strange(folder: Path, patterns: Iterable[str], what: str) -> None:
+    """Refuse a folder with files that would be replaced, unless they are known to be of earlier results.
+
+    Args:
+        folder: The folder, which holds no earlier results of the kind that are to be written.
+        patterns: What their files are called.
+        what: Their kind, for the message: a run.
+
+    Raises:
+        GavoError: There is such a file.
+    """
+    found = next((path for pattern in patterns for path in sorted(folder.glob(pattern))), None)
+    if found is not None:
+        raise GavoError(f"{found}: is not from {what}, which would replace it: choose another folder")
 
 
 def remove_files(folder: Path, *names: str) -> None:

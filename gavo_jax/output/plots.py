@@ -298,7 +298,8 @@ def plot_drift(clips: Mapping[str, Mapping[str, Float[np.ndarray, "runs 2"]]], o
     """Draw the drift of every method on every clip as bars, other libraries' hatched.
 
     Args:
-        clips: Drift in translation (m/s) and rotation (deg/s) of every run, by clip and method.
+        clips: Drift in translation (m/s) and rotation (deg/s) of every run, by clip and method; +inf for a run without,
+            of a camera that was lost.
         ours: Names of the project's own methods.
     """
     rows = max(len(methods) for methods in clips.values())
@@ -309,15 +310,22 @@ def plot_drift(clips: Mapping[str, Mapping[str, Float[np.ndarray, "runs 2"]]], o
     panels = figure.subplots(len(clips), 2, squeeze=False)
     for (clip, methods), pair in zip(clips.items(), panels, strict=True):
         for column, (axes, label) in enumerate(zip(pair, ("translation (m/s)", "rotation (deg/s)"), strict=True)):
-            decimals = _decimals(np.concatenate([runs[:, column] for runs in methods.values()]), (4, 2)[column])
+            all_values = np.concatenate([runs[:, column] for runs in methods.values()])
+            decimals = _decimals(all_values[np.isfinite(all_values)], (4, 2)[column])
             for place, (name, runs) in enumerate(methods.items()):
-                values = runs[:, column]
-                middle = float(np.median(values))
+                values = runs[np.isfinite(runs[:, column]), column]
+                lost = len(runs) - len(values)
+                # nothing lies between a number and infinity
+                middle = float(np.quantile(runs[:, column], 0.5, method="higher" if lost else "linear"))
+                if not np.isfinite(middle):
+                    axes.annotate(f" no drift in {lost} of {len(runs)}", (0, place), va="center", fontsize=7)
+                    continue
                 mine = {"color": COLORS[0], "edgecolor": "black"}
                 style = mine if name in ours else {"color": "#E4E4E4", "edgecolor": "#808080", "hatch": "//"}
                 spread = [[middle - values.min()], [values.max() - middle]] if len(values) > 1 else None
                 axes.barh(place, middle, xerr=spread, linewidth=0.5, capsize=2, **style)
-                axes.annotate(f" {middle:.{decimals}f}", (values.max(), place), va="center", fontsize=7)
+                without = f", none in {lost} of {len(runs)}" if lost else ""
+                axes.annotate(f" {middle:.{decimals}f}{without}", (values.max(), place), va="center", fontsize=7)
             names = [shown_name(name) for name in methods] if column == 0 else [""] * len(methods)
             axes.set_yticks(range(len(methods)), names, fontsize="small")
             axes.invert_yaxis()

@@ -38,6 +38,7 @@ from gavo_jax.output.files import (
     differences,
     prepare_folder,
     refuse_foreign,
+    refuse_strange,
     remove_figures,
     remove_files,
     write_json,
@@ -166,8 +167,8 @@ class RunFolder:
             is_of_run = "odometry" in read_json_object(self.path / CONFIG)
         except GavoError:
             is_of_run = False
-        if found := [] if is_of_run else [path for name in REPLACED for path in sorted(self.path.glob(name))]:
-            raise GavoError(f"{found[0]}: is not from a run, and this run would replace it: choose another folder")
+        if not is_of_run:
+            refuse_strange(self.path, REPLACED, "a run")
 
     def start(self, config: Mapping[str, Any], timestamp: float) -> None:
         """Remove an earlier run's files, and write config.json and the first pose, the identity.

@@ -789,8 +789,32 @@ def test_an_interrupted_comparison_says_so(gavo, pristine, tmp_path, monkeypatch
 )
 def test_a_lost_run_is_worse_than_any_other(drifts, typical):
     """With one lost run, the first seed stood in the table, though another was in the middle."""
-    runs = [compare.Entry("ga", {compare.DRIFT: drift}, seed) for seed, drift in enumerate(drifts)]
+    figures = [{compare.DRIFT: drift, compare.ROTATION_DRIFT: drift} for drift in drifts]
+    runs = [compare.Entry("ga", metrics, seed) for seed, metrics in enumerate(figures)]
     assert compare._typical_runs(runs) == [runs[typical]]
+
+
+def test_a_range_with_a_lost_run_has_no_end():
+    """It spanned the runs that were left, and the figure was left out without a word."""
+    one = Trajectory([0.0], np.eye(4)[None])
+    figures = dict.fromkeys((key for _, key, _ in compare.COLUMNS), 0.02) | {"segments": 1}
+    lost = figures | {compare.DRIFT: None, compare.ROTATION_DRIFT: None}
+    runs = [compare.Entry("ga", metrics, one) for metrics in (lost, figures, figures)]
+    (row,) = compare._rows(runs, compare._typical_runs(runs))
+    assert row[-3:] == [3, "0.0200", compare.DASH]
+    assert compare._drifts(runs)["ga"][:, 0].tolist() == [np.inf, 0.02, 0.02]
+    (line,) = compare._without_drift(runs)
+    assert line.startswith("No drift in 1 of 3 runs of ga, which count as infinite")
+    assert compare._drifts(runs[:1]) == {} and compare._without_drift(runs[:1]) == []
+
+
+@pytest.mark.parametrize("name", ["report.html", "ga.txt", "drift.svg", "trajectory.png", "experiment.json"])
+def test_compare_replaces_only_what_a_comparison_wrote(gavo, pristine, tmp_path, name):
+    """A user's own files were removed or replaced, and an experiment's report, without a word."""
+    (tmp_path / name).write_text("mine")
+    source = (pristine, "--camera", pristine / "camera.toml", "--frames", 5, "--methods", "opencv-rgb")
+    assert is_refused(gavo("compare", *source, "--output", tmp_path), name, "choose another folder")
+    assert (tmp_path / name).read_text() == "mine"
 
 
 def test_results_of_two_kinds_do_not_share_a_folder(gavo, pristine, tmp_path):

@@ -90,11 +90,31 @@ def test_a_folder_in_use_is_refused_in_one_line_and_left_alone(gavo, tmp_path, m
 
 
 def test_a_comparison_leaves_no_trajectory_of_an_earlier_one(gavo, tmp_path):
-    (tmp_path / "out").mkdir()
+    assert gavo(*COMPARE).status == 0
     for name in ("ga-seed3.txt", "pso.txt", "notes.txt"):
         (tmp_path / "out" / name).write_text("of an earlier one")
     assert gavo(*COMPARE).status == 0
     assert sorted(path.name for path in (tmp_path / "out").glob("*.txt")) == ["notes.txt", "opencv-rgb.txt"]
+
+
+@pytest.mark.parametrize("name", ["report.html", "drift.png", "frames.csv", "comparison.json"])
+def test_an_experiment_replaces_only_what_an_experiment_wrote(gavo, tmp_path, name):
+    """A user's own files were replaced without a word, and results of two kinds lay in one folder."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("mine")
+    toml = write("e.toml", EXPERIMENT, seeds=1, frames=34, damping=0.001)
+    done = gavo("experiment", toml, "--output", "out")
+    assert done.status == 2 and done.err.count("\n") == 1 and name in done.err, done.err
+    assert (tmp_path / "out" / name).read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["..", "../../t"])
+def test_a_studys_name_is_no_path(gavo, tmp_path, name):
+    """Its results lay outside the folder of results."""
+    text = TUNING.format(trials=1, frames=34, choices=["huber"])
+    (tmp_path / "t.toml").write_text(f'name = "{name}"\n{text}')
+    done = gavo("tune", "t.toml")
+    assert done.status == 2 and "cannot be a path" in done.err, done.err
 
 
 def test_a_run_that_is_refused_a_comparisons_folder_leaves_it_alone(gavo, tmp_path):

@@ -289,6 +289,16 @@ def test_a_drift_of_single_runs_has_neither_median_nor_whiskers():
     assert "median" in several and "median" not in single
 
 
+def test_a_drift_with_lost_runs_counts_them_as_the_worst():
+    """The bar was the median of the runs that were left, and a method that was always lost had none."""
+    lost = [np.inf, np.inf]
+    runs = {"ga": np.array([[0.01, 1.0], lost, lost]), "pso": np.array([[0.02, 2.0], [0.04, 4.0], lost])}
+    translation = plots.plot_drift({"clip": runs | {"adam": np.array([lost])}}, ["ga", "pso", "adam"]).axes[0]
+    assert [bar.get_patch_transform().transform((1.0, 0.0))[0] for bar in translation.patches] == [0.04]
+    words = [text.get_text().strip() for text in translation.texts]
+    assert words == ["no drift in 2 of 3", "0.0400, none in 1 of 3", "no drift in 1 of 1"]
+
+
 def test_drift_bars_are_medians_and_others_are_hatched():
     runs = np.array([[0.01, 1.0], [0.05, 3.0], [0.02, 2.0]])
     figure = plots.plot_drift({"clip": {"ga": runs, "opencv-rgb": runs[:1]}}, ["ga"])
