@@ -20,7 +20,7 @@ from gavo_jax.bodies.records import without_moving
 from gavo_jax.camera import Camera, require_camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence, require_sequence
 from gavo_jax.datasets.rectified import rectified
-from gavo_jax.errors import GavoError, GavoWarning, as_path, partial_of
+from gavo_jax.errors import GavoError, GavoWarning, as_number, as_path, partial_of
 from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.libusb import import_open3d
 from gavo_jax.map_blocks import BLOCK, MOST_BLOCKS, image_for_blocks
@@ -28,7 +28,7 @@ from gavo_jax.odometry.driver import Moving, Step, seen_moving
 from gavo_jax.odometry.overlays import AsTracked
 from gavo_jax.se3 import is_rigid
 from gavo_jax.status import AlignmentStatus
-from gavo_jax.trajectory import Trajectory, inverse, stamp_name
+from gavo_jax.trajectory import Trajectory, inverse, require_trajectory, stamp_name
 
 Shape = Literal["cloud", "mesh"]
 
@@ -89,7 +89,9 @@ class SceneMap:
         path = as_path(path)
         check_map(path, self.shape)
         if len(self.points) == 0:
-            raise GavoError(f"{path}: not written: nothing nearer than {FARTHEST:g} m was seen often enough for a map")
+            raise GavoError(
+                f"{path}: not written: nothing near enough ({FARTHEST:g} m by default) was seen often enough for a map"
+            )
         open3d = import_open3d("map")
         vector = open3d.utility.Vector3dVector
         partial = path.with_name(partial_of(path).name + path.suffix.lower())  # Open3D goes by the suffix
@@ -139,12 +141,14 @@ class MapBuilder:
             farthest: depth beyond this is left out, metres.
 
         Raises:
-            GavoError: not a camera, voxel size out of range, or Open3D cannot be imported.
+            GavoError: not a camera, voxel size or depth out of range, or Open3D cannot be imported.
         """
         check_voxel(voxel)
         require_camera(camera)
         self._recorded = camera
-        self.camera, self.voxel, self.farthest = camera.rectified(), voxel, farthest
+        self.camera, self.voxel, self.farthest = camera.rectified(), voxel, as_number("farthest", farthest)
+        if not 0 < self.farthest < np.inf:
+            raise GavoError(f"farthest: must be a positive number of metres, not {farthest:g}")
         self._open3d = import_open3d("map")
         core = self._open3d.core
         self._intrinsic = core.Tensor(self.camera.matrix)
@@ -162,15 +166,20 @@ class MapBuilder:
             world_T_camera: its pose; the map is in that world, metres.
 
         Raises:
-            FrameError: an image is not of the camera's size.
-            GavoError: the pose is not a 4x4 matrix of a rigid motion.
+            FrameError: an image is not of the camera's size, or colour not RGB of bytes.
+            GavoError: not a frame, or the pose is not a 4x4 matrix of a rigid motion.
         """
+        if not isinstance(frame, Frame):
+            raise GavoError(f"expected a Frame, got {type(frame).__name__}: use gavo.Frame(grey, depth, timestamp)")
         image, core = self._open3d.t.geometry.Image, self._open3d.core
         world_T_camera = np.asarray(world_T_camera)
         if world_T_camera.shape != (4, 4) or not is_rigid(world_T_camera):
             raise GavoError("world_T_camera: expected a 4x4 matrix of a rotation and a translation")
-        if frame.color is not None and np.shape(frame.color) != (*np.shape(frame.grey), 3):
-            raise FrameError(f"color image has shape {np.shape(frame.color)}: expected {(*np.shape(frame.grey), 3)}")
+        if (color := frame.color) is not None:
+            shape = (*np.shape(frame.grey), 3)
+            if np.shape(color) != shape or np.asarray(color).dtype != np.uint8:
+                found = f"{np.asarray(color).dtype} of shape {np.shape(color)}"
+                raise FrameError(f"color image is {found}: expected uint8 of {shape}")
         frame = rectified(frame, self._recorded)
         metres = np.asarray(frame.depth, np.float32) / np.float32(self.camera.depth_scale)
         metres = np.where((metres > 0) & (metres < self.farthest), metres, np.float32(0))
@@ -322,11 +331,13 @@ def build_map(
         on_frame: called for each frame.
 
     Raises:
-        GavoError: not a sequence, unknown shape, voxel size out of range, or Open3D cannot be imported.
+        GavoError: not a sequence or its steps, unknown shape, voxel size out of range, or Open3D cannot be imported.
     """
     check_shape(shape)
     require_sequence(sequence)
-    steps = list(steps)
+    steps = _steps_of(sequence, steps)
+    if trajectory is not None:
+        require_trajectory(trajectory)
     frames = AsTracked(sequence, steps)
     corrected = _PosesInOrder(trajectory, float(sequence.timestamps[0]))
     places: list[tuple[int, Step | None, np.ndarray, int]] = [(0, None, np.eye(4), 0)]
@@ -354,6 +365,16 @@ def build_map(
         except FrameError:
             reasons[UNREADABLE] += 1
     return builder.extract(shape, _left_out(reasons))
+
+
+def _steps_of(sequence: Sequence, steps: Any) -> list[Step]:
+    """Return steps as a list; raises GavoError unless they are those of a run over the sequence."""
+    steps = list(steps) if isinstance(steps, Iterable) else [None]
+    if not all(isinstance(step, Step) for step in steps):
+        raise GavoError("steps: expected the steps of a run, run.steps")
+    if steps and max(step.index for step in steps) >= len(sequence):
+        raise GavoError(f"steps: of a longer sequence than this one, which has {len(sequence)} frames")
+    return steps
 
 
 class _PosesInOrder:

@@ -153,6 +153,8 @@ def as_settings(value: "Settings | Solver | None" = None, solver: Solver | None 
         TypeError: `value` is neither.
         GavoError: A value in it is of the wrong kind or out of its range.
     """
+    if isinstance(named := getattr(value, "settings", None), Settings):  # what `load_settings` returns
+        value = named
     if value is None:
         settings = Settings()
     elif isinstance(value, Settings):
@@ -160,7 +162,7 @@ def as_settings(value: "Settings | Solver | None" = None, solver: Solver | None 
     elif isinstance(value, Solver) and not isinstance(value, type):
         settings = Settings(value)
     else:
-        hint = f": gavo.preset({value!r}) gives a method's settings" if isinstance(value, str) else ""
+        hint = ": gavo.preset(METHOD, PRESET) gives settings, as of 'ga' and 'fast'" if isinstance(value, str) else ""
         raise TypeError(f"neither Settings nor a solver: {type(value).__name__}{hint}")
     given = {name: part for name, part in parts.items() if part is not None}
     if given:

@@ -65,6 +65,21 @@ def test_a_map_of_something_else_is_refused() -> None:
         MapBuilder("fr1")  # pyright: ignore[reportArgumentType]
     with pytest.raises(GavoError, match="expected a Sequence, got NoneType"):
         build_map(None, ())  # pyright: ignore[reportArgumentType]
+    sequence: Any = SyntheticSequence(2, camera=CAMERA)
+    other: Any = None
+    for steps in (other, [None], OdometryRun(other, [], other)):
+        with pytest.raises(GavoError, match="expected the steps of a run, run.steps"):
+            build_map(sequence, steps)
+    with pytest.raises(GavoError, match="expected a Trajectory, got str"):
+        build_map(sequence, [], trajectory="trajectory.txt")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.usefixtures("open3d")
+@pytest.mark.parametrize("farthest", [-1.0, 0, float("nan"), float("inf"), "4 m", None])
+def test_absurd_depths_are_refused(farthest: Any) -> None:
+    """All readings were left out without a word, or the first frame ended in a traceback."""
+    with pytest.raises(GavoError, match="farthest: "):
+        MapBuilder(CAMERA, farthest=farthest)
 
 
 def test_without_open3d_one_line_says_what_to_install(monkeypatch):
@@ -198,7 +213,7 @@ def test_a_live_map_waits_for_a_frame_that_fits_its_first_one(second, begins):
 def test_an_empty_map_is_not_written(tmp_path, name):
     triangles = np.zeros((0, 3), int) if name == "a.obj" else None
     nothing = SceneMap(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3)), triangles)
-    with pytest.raises(GavoError, match="not written: nothing nearer than 4 m"):
+    with pytest.raises(GavoError, match="not written: nothing near enough \\(4 m by default\\)"):
         nothing.write(tmp_path / name)
 
 
@@ -265,8 +280,11 @@ def test_frames_that_do_not_fit_are_refused_and_no_reading_is_a_surface():
             builder.add(frame, pose)
     with pytest.raises(FrameError, match="of shape"):
         builder.add(replace(frame, grey=frame.grey[:50], depth=frame.depth[:50]), np.eye(4))
-    with pytest.raises(FrameError, match="color image has shape"):
-        builder.add(replace(frame, color=np.zeros((50, 160, 3), np.uint8)), np.eye(4))
+    for color in (np.zeros((50, 160, 3), np.uint8), np.zeros((120, 160, 3), np.float32)):
+        with pytest.raises(FrameError, match="color image is .*: expected uint8 of"):
+            builder.add(replace(frame, color=color), np.eye(4))
+    with pytest.raises(GavoError, match="expected a Frame, got tuple"):
+        builder.add((frame.grey, frame.depth), np.eye(4))  # pyright: ignore[reportArgumentType]
     with pytest.raises(GavoError, match="cloud or mesh, not 'sphere'"):
         builder.extract("sphere")  # pyright: ignore[reportArgumentType]
     assert builder.frames == 0

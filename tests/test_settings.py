@@ -26,8 +26,14 @@ def test_a_solver_stands_for_the_default_settings_with_it():
 
 
 def test_the_name_of_a_method_is_told_what_gives_its_settings():
-    with pytest.raises(TypeError, match=r"neither Settings nor a solver: str: gavo.preset\('ga'\) gives"):
-        as_settings("ga")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match=r"neither Settings nor a solver: str: gavo.preset\(METHOD, PRESET\) gives"):
+        as_settings("fast")  # pyright: ignore[reportArgumentType]
+
+
+def test_settings_of_a_file_stand_for_themselves(tmp_path):
+    """What `load_settings` returns was refused, without a word on its part that holds them."""
+    (tmp_path / "s.toml").write_text('method = "pso"\npreset = "fast"\n')
+    assert as_settings(gavo.load_settings(tmp_path / "s.toml")) == gavo.preset("pso", "fast")  # pyright: ignore
 
 
 @pytest.mark.parametrize("wrong", ["ga", gavo.AlignmentOptions(), gavo.GaussNewton])

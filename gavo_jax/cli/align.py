@@ -30,6 +30,7 @@ from gavo_jax.interrupts import interruptible
 from gavo_jax.output.files import json_text
 from gavo_jax.output.screen import say, waiting
 from gavo_jax.settings_check import as_seed
+from gavo_jax.settings_file import assignments
 from gavo_jax.trajectory import inverse
 
 MATRIX_DIGITS, TWIST_DIGITS = 7, 4
@@ -40,6 +41,8 @@ def align(options: Align) -> int:
     """Print `target_T_reference`, `xi`, `error`, `overlap`, `covariance`, `status` and more for one pair."""
     as_seed(options.seed, "--seed")
     check_positive("--depth-scale", options.depth_scale, 1e6)
+    if idle := [name for name in assignments(options.set) if name.startswith("odometry.")]:
+        raise GavoError(f"--set: {idle[0]} applies to runs only, not to a pair")
     settings = choose_settings(options).settings
     images = [(options.rgb0, options.depth0), (options.rgb1, options.depth1)]
     for path in itertools.chain.from_iterable(images):

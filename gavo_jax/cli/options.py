@@ -10,8 +10,8 @@ from gavo_jax import presets
 from gavo_jax.peers.registry import PEERS
 
 METHODS = (*presets.METHODS, *presets.plugin_names())
-Method = Annotated[str, arg(metavar=f"{{{','.join(METHODS)}}}")]
-"""A name of `presets.methods()`; the help lists those of other packages without loading their code."""
+METHOD = f"{{{','.join(METHODS)}}}"
+"""Names of `presets.methods()`; the help lists those of other packages without loading their code."""
 PresetName = Literal["default", "paper", "fast", "wide"]
 
 # tyro keeps the line breaks of a docstring, so texts longer than a line are given as `help`
@@ -58,17 +58,21 @@ class SearchOptions:
     """The search and its settings."""
 
     method: Annotated[
-        Method,
+        str | None,
         arg(
+            metavar=METHOD,
+            help_behavior_hint="(default: ga)",
             help="Genetic algorithm, particle swarm, Gauss-Newton (the classic method), Adam. Installed "
-            "packages may add others."
+            "packages may add others.",
         ),
-    ] = "ga"
+    ] = None
     preset: Annotated[
-        PresetName,
+        PresetName | None,
         arg(
+            metavar="{default,paper,fast,wide}",
+            help_behavior_hint="(default: default)",
             help="Settings: the project's own, the paper's, for speed, for large motions. Each of the four methods has "
-            "all of them; a method of another package has only default."
+            "all of them; a method of another package has only default.",
         ),
     ] = "default"
     settings: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the preset's)")] = None
@@ -138,7 +142,7 @@ class Compare(Source):
     preset: PresetName = "default"
     """Preset of those of the project's methods that are named without one."""
     seeds: Annotated[int, arg(metavar="N")] = 1
-    """Run each random method with seeds 0 to N - 1; the table and figures show the run of median drift."""
+    """Run each of the project's methods with seeds 0 to N - 1; the table and figures show the run of median drift."""
     output: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/SEQUENCE-compare-PRESET)")] = (
         None
     )

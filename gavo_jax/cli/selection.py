@@ -71,15 +71,16 @@ def choose_settings(search: SearchOptions) -> NamedSettings:
     Raises:
         GavoError: the method, the file or a single setting is invalid.
     """
-    if search.method not in presets.methods():
-        raise GavoError(f"--method: {search.method!r} is not one of {', '.join(presets.usable_methods())}")
+    method, preset = search.method or "ga", search.preset or "default"
+    if method not in presets.methods():
+        raise GavoError(f"--method: {method!r} is not one of {', '.join(presets.usable_methods())}")
     if search.settings is None:
-        named = NamedSettings(search.method, search.preset, presets.preset(search.method, search.preset))
+        named = NamedSettings(method, preset, presets.preset(method, preset))
     else:
-        named = load_settings(search.settings, search.method, search.preset)
+        named = load_settings(search.settings, method, preset)
         for name in ("method", "preset"):
             asked, said = getattr(search, name), getattr(named, name)
-            if asked not in (said, getattr(SearchOptions, name)):
+            if asked not in (said, None):
                 raise GavoError(f"--{name} {asked}: {search.settings} says {said}: omit one of them")
     return named._replace(settings=override(named.settings, assignments(search.set), "--set"))
 
@@ -88,8 +89,16 @@ FRAMES_AND_SEED = ("sequence", "start", "frames", "stride", "camera", "depth_sca
 """Options of a run that are not settings."""
 
 
+SHORTCUTS = ("reference", "on_lost", "bodies", "loops")
+"""Settings of the odometry that have options of their own."""
+
+
 def with_shortcuts(settings: Settings, options: Run) -> Settings:
     """Return the settings with the dedicated options (`--reference`, `--on-lost`, `--bodies`, `--loops`) applied."""
+    for name in set(assignments(options.set)) & {f"odometry.{name}" for name in SHORTCUTS}:
+        option = name.partition(".")[2]
+        if getattr(options, option):
+            raise GavoError(f"--{option.replace('_', '-')}: --set {name} says the same: omit one of them")
     odometry = settings.odometry
     if options.reference is not None:
         odometry = replace(odometry, reference=options.reference)
@@ -102,7 +111,7 @@ def with_shortcuts(settings: Settings, options: Run) -> Settings:
 
 def unchanged_preset(settings: Settings, options: Run) -> str | None:
     """Return the name of a run's preset; None if more than the dedicated options has changed its settings."""
-    unchanged = with_shortcuts(presets.preset(options.method, options.preset), options)
+    unchanged = with_shortcuts(presets.preset(options.method or "ga", options.preset or "default"), options)
     return options.preset if presets.are_same(settings, unchanged) else None
 
 

@@ -42,6 +42,7 @@ def choose_usual() -> None:
     """
     for name, (usual, _) in USUAL.items():
         jax.config.update(name, usual)
+    jax.config.update("jax_disable_jit", False)  # a frame would take minutes
 
 
 def in_32_bits(function: Callable[P, R]) -> Callable[P, R]:

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -275,7 +276,9 @@ def _bounds(place: str, spec: Any) -> list[Any]:
 
 def _suggest(trial: Any, key: str, spec: Any, whole: bool) -> Any:
     if isinstance(spec, list):
-        return trial.suggest_categorical(key, spec)
+        with warnings.catch_warnings():  # a choice may be a list: it is found again in the study by its text
+            warnings.filterwarnings("ignore", "Choices for a categorical distribution", UserWarning)
+            return trial.suggest_categorical(key, spec)
     low, high, step, log = spec["low"], spec["high"], spec.get("step"), spec.get("log", False)
     if step is not None:  # the last value reached by whole steps
         high = low + step * math.floor((high - low) / step + 1e-9)

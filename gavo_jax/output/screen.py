@@ -160,7 +160,7 @@ def _width(table: Table) -> int:
 def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     """Return a Markdown table whose first column is text and whose others are numbers."""
     rule = ["---", *["---:"] * (len(columns) - 1)]
-    lines = ([printable(str(cell)) for cell in cells] for cells in (columns, rule, *rows))
+    lines = ([printable(str(cell)).replace("|", r"\|") for cell in cells] for cells in (columns, rule, *rows))
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 

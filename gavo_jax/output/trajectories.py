@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.errors import GavoError, as_path, partial_of
+from gavo_jax.errors import GavoError, as_path, partial_of, shown
 from gavo_jax.output.files import TRAJECTORY, json_text, remove_files
 from gavo_jax.trajectory import Trajectory, quaternion_from_rotation, require_trajectory, write_lines
 
@@ -68,8 +68,8 @@ def check_format(form: str) -> None:
     Raises:
         GavoError: The format is unknown, or it is a bag and the extra `[bag]` is missing.
     """
-    if form not in WRITERS:
-        raise GavoError(f"trajectory format {form[:60]!r}: not one of {', '.join(WRITERS)}")
+    if not isinstance(form, str) or form not in WRITERS:
+        raise GavoError(f"trajectory format {shown(form)}: not one of {', '.join(WRITERS)}")
     if form == "bag":
         _import_rosbags()
 

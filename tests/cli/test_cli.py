@@ -745,6 +745,21 @@ def test_a_method_that_the_settings_contradict_is_told(gavo, pristine, tmp_path)
     source = ("run", pristine, "--camera", pristine / "camera.toml", "--settings", tmp_path / "own.toml")
     assert is_refused(gavo(*source, "--method", "pso"), "--method pso: ", "says gauss-newton", "omit one of them")
     assert is_refused(gavo(*source, "--preset", "wide"), "--preset wide: ", "says fast")
+    assert is_refused(gavo(*source, "--method", "ga"), "--method ga: ", "says gauss-newton"), "though the default"
+    assert is_refused(gavo(*source, "--preset", "default"), "--preset default: ", "says fast")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("run", "--set", "odometry.bodies=off", "--bodies", "track"), "--bodies: --set odometry.bodies says the same"),
+        (("run", "--set", "odometry.loops=false", "--loops"), "--loops: --set odometry.loops says the same"),
+        (("align", "a", "b", "c", "d", "--set", "odometry.bodies=track"), "odometry.bodies applies to runs only"),
+    ],
+)
+def test_options_that_overrule_others_are_refused(gavo, arguments, words):
+    """One of two that contradict each other was left aside without a word, as was one without effect."""
+    assert is_refused(gavo(*arguments), words)
 
 
 def test_presets_of_one_method_are_compared(gavo, pristine, tmp_path):

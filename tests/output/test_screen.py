@@ -12,7 +12,7 @@ from gavo_jax.cli.run_table import print_run
 from gavo_jax.odometry.driver import Step
 from gavo_jax.output.bodies import BODY_COLUMNS
 from gavo_jax.output.frames import FRAME_COLUMNS, frame_row
-from gavo_jax.output.screen import known_columns, number, print_table, say
+from gavo_jax.output.screen import known_columns, markdown_table, number, print_table, say
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
 
@@ -146,3 +146,7 @@ def test_lines_fit_a_terminal_and_stay_whole_for_programs(
     printed = capsys.readouterr().out
     assert max(len(line) for line in printed.splitlines() if path not in line) <= 80
     assert " ".join(printed.split()) == f"{LONG} files in {path}"
+
+
+def test_a_bar_in_a_name_does_not_split_a_markdown_row() -> None:
+    assert r"| a\|b | 1 |" in markdown_table(["name", "n"], [["a|b", 1]])

@@ -1,5 +1,6 @@
 import csv
 import json
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -105,3 +106,9 @@ def test_what_is_no_trajectory_is_not_written(tmp_path, form, stamp, scale, word
     with pytest.raises(GavoError, match=words):
         write_trajectory(trajectory, tmp_path / "poses", form)
     assert not (tmp_path / "poses").exists()
+
+
+@pytest.mark.parametrize("form", [None, ["tum"], "xyz"])
+def test_an_unknown_format_is_refused(form: Any, tmp_path: Path) -> None:
+    with pytest.raises(GavoError, match="trajectory format .*: not one of tum, "):
+        write_trajectory(TRAJECTORY, tmp_path / "t", form)

@@ -71,6 +71,8 @@ def frame_of(images: LiveImages, camera: Camera, color: bool = False) -> Frame:
         GavoError: an image has the wrong size or type; the message says what was expected.
     """
     require_camera(camera)
+    if not isinstance(images, LiveImages):
+        raise GavoError(f"expected gavo.LiveImages(color, depth, timestamp), got {type(images).__name__}")
     size = (camera.height, camera.width)
     image, depth = np.asarray(images.color), np.asarray(images.depth)
     if image.dtype != np.uint8 or image.shape not in (size, (*size, 3)):

@@ -87,6 +87,13 @@ def test_images_of_another_size_or_type_are_refused(changes, words):
         frame_of(images()._replace(**changes), CAMERA)
 
 
+def test_what_a_device_must_deliver_is_told():
+    """A plain tuple ended a run in a traceback."""
+    for images in (None, (np.zeros((4, 4), np.uint8), np.zeros((4, 4), np.uint16), 0.0)):
+        with pytest.raises(GavoError, match=r"expected gavo.LiveImages\(color, depth, timestamp\), got"):
+            frame_of(images, CAMERA)  # pyright: ignore[reportArgumentType]
+
+
 def test_frames_are_rectified():
     raw = images(3)
     frame, plain = frame_of(raw, LENS, color=True), frame_of(raw, CAMERA, color=True)
