@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from jaxtyping import Bool
 
-from gavo_jax.errors import GavoError, read_json_object, read_text
+from gavo_jax.errors import GavoError, read_json_object, read_text, shown
 from gavo_jax.locks import hold
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.progress import Progress
@@ -251,7 +251,10 @@ class RunFolder:
         if not path.exists() or (self.path / CHECKPOINT).exists():
             return None
         metrics = read_json_object(path)
-        if metrics.get(IMAGES, unchanged := self._seen.up_to(metrics.get("pairs", 0))) != unchanged:
+        pairs = metrics.get("pairs", 0)
+        if not isinstance(pairs, int):
+            raise GavoError(f"{path}: pairs: expected a whole number, got {shown(pairs)}")
+        if metrics.get(IMAGES, unchanged := self._seen.up_to(pairs)) != unchanged:
             raise GavoError(_other_images(path))
         self._revise()  # it may have been killed before that
         return metrics

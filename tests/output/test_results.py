@@ -183,6 +183,16 @@ def test_a_last_row_without_a_pose_stays_if_its_stamp_is_in_doubt(tmp_path: Path
     assert len(read_run(tmp_path).steps) == 2
 
 
+def test_metrics_that_were_edited_are_told(tmp_path: Path) -> None:
+    """A number of pairs that is none ended `gavo run --resume` in a traceback."""
+    with RunFolder(recorded(tmp_path / "run")) as folder:
+        write_json(folder.path / "metrics.json", {"pairs": 3})
+        assert folder.finished() is not None
+        write_json(folder.path / "metrics.json", {"pairs": "three"})
+        with pytest.raises(GavoError, match="metrics.json: pairs: expected a whole number, got 'three'"):
+            folder.finished()
+
+
 @pytest.mark.parametrize("name", ["frames.csv", "trajectory.txt"])
 def test_a_finished_run_is_whole(tmp_path: Path, name: str) -> None:
     """`gavo view` showed what was left of it, as if it were still going on."""
