@@ -9,7 +9,7 @@ nothing.
     python benchmarks/ablation.py --clips fr1_desk:40 --variants depth,prior --seeds 2 --json ablation.json
     python benchmarks/ablation.py --preset fast --variants views,stagnation
 
-On 2 cores the defaults (3 clips, 5 seeds, 13 rows) take about 20 minutes.
+On 2 cores the defaults (3 clips, 5 seeds, 16 rows) take about 25 minutes.
 """
 
 from collections.abc import Callable

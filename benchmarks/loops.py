@@ -17,6 +17,8 @@ frame, not in parallel with tracking, so that the two can be timed separately.
     python benchmarks/loops.py --clips fr1_desk_loop --parts clips,false
     python benchmarks/loops.py --parts covered --map-of fr1_desk_loop --tried fr1_desk
     python benchmarks/loops.py --parts long
+
+On 2 cores the defaults take about 10 minutes.
 """
 
 import os

@@ -14,6 +14,7 @@ import argparse
 import re
 import sys
 import tomllib
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -147,23 +148,56 @@ OF_TABLE_1 = {"ga, paper": ("ga, paper", "m/s"), "printed": ("ga", "printed")}
 CLIPS = ("fr1_xyz", "fr1_desk", "fr1_rpy")
 
 
+MARKS = "†‡§¶"
+"""Marks of README's figures that are of another version of JAX than most."""
+
+
+class Figure(NamedTuple):
+    """A figure of README's table, and the record that it is from; None for a dash."""
+
+    text: str
+    record: Record | None = None
+
+    @property
+    def version(self) -> str:
+        """Version of JAX that it was measured with; empty if none is known."""
+        return (self.record and jax_of(self.record)) or ""
+
+
 def share_found(record: Record, share: str) -> str:
     """The share of motions found, marked if it is of all pairs; `benchmarks/basin.py` takes every fourth by default."""
     return f"{share} (all)" if "--step 1 " in record.command else share
 
 
-def summary(records: Records) -> Table:
-    """README's table: drift on each clip, motions found over a wide baseline, and time."""
+def summary_figures(records: Records) -> list[list[Figure]]:
+    """The figures of each row of README's table: drift on each clip, motions found over a wide baseline, and time."""
+
+    def figure(*place: str) -> Figure:
+        return next((Figure(text, record) for record, text in records.cells(*place)), Figure(UNKNOWN))
+
     rows = []
-    for title, method in SUMMARY:
+    for _, method in SUMMARY:
         if method in OF_TABLE_1:
-            drift = [f"{float(records.cell('table1', 'fr1_xyz', *OF_TABLE_1[method])):.4f}", UNKNOWN, UNKNOWN]
+            drift = figure("table1", "fr1_xyz", *OF_TABLE_1[method])
+            drifts = [drift._replace(text=f"{float(drift.text):.4f}"), Figure(UNKNOWN), Figure(UNKNOWN)]
         else:
-            drift = [records.cell("drift", f"drift on {clip}", method, "m/s") for clip in CLIPS]
-        found = next(records.cells("basin", "success rate on fr1_rpy", method, "10 frames"), None)
-        time = records.cell("throughput", "fr1_xyz", method, "/ opencv-rgbd")
-        rows.append((title, *drift, UNKNOWN if found is None else share_found(*found), time))
-    return Table("", ("", *CLIPS, "found", "time"), tuple(rows))
+            drifts = [figure("drift", f"drift on {clip}", method, "m/s") for clip in CLIPS]
+        found = figure("basin", "success rate on fr1_rpy", method, "10 frames")
+        if found.record is not None:
+            found = found._replace(text=share_found(found.record, found.text))
+        rows.append([*drifts, found, figure("throughput", "fr1_xyz", method, "/ opencv-rgbd")])
+    return rows
+
+
+def summary(records: Records) -> Table:
+    """README's table; figures of another version of JAX than most are marked."""
+    marks = marks_of_versions(records)
+
+    def marked(figure: Figure) -> str:
+        return f"{figure.text} {marks.get(figure.version, '')}".rstrip()
+
+    rows = zip(SUMMARY, summary_figures(records), strict=True)
+    return Table("", ("", *CLIPS, "found", "time"), tuple((title, *map(marked, row)) for (title, _), row in rows))
 
 
 def markdown(table: Table) -> str:
@@ -187,21 +221,19 @@ def ruled_out(record: Record) -> str | None:
     return f"JAX {version} is ruled out: it can compute wrong numbers on a CPU. These figures await a new measurement."
 
 
+def marks_of_versions(records: Records) -> dict[str, str]:
+    """The mark of each version of JAX in README's table; that of most figures has none."""
+    counts = Counter(figure.version for row in summary_figures(records) for figure in row if figure.version)
+    return dict(zip([version for version, _ in counts.most_common()], ["", *MARKS], strict=False))
+
+
 def sources_of_summary(records: Records) -> str:
-    """A sentence that names the version of JAX of each column of README's table."""
-    columns = {"Drift": "drift", "*found*": "basin", "*time*": "throughput"}
-    by_version: dict[str, list[str]] = {}
-    for column, benchmark in columns.items():
-        by_version.setdefault(jax_of(records.of(benchmark)[0]) or UNKNOWN, []).append(column)
-    parts = [
-        f"{_listed(names)} {'is' if len(names) == 1 else 'are'} of JAX {version}"
-        for version, names in by_version.items()
-    ]
+    """A sentence that names the versions of JAX of README's figures."""
+    parts = []
+    for version, mark in marks_of_versions(records).items():
+        remark = "" if ALLOWED.contains(version, prereleases=True) else ", which is ruled out"
+        parts.append(f"{mark or 'Measured'} with JAX {version}{remark}")
     return "; ".join(parts) + "."
-
-
-def _listed(names: Sequence[str]) -> str:
-    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def section(records: Sequence[Record]) -> str:

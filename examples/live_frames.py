@@ -1,8 +1,8 @@
 """Frames as they come from a camera: `Odometry.register`, one call a frame.
 
 Run it as `python examples/live_frames.py`. The synthetic room stands in for the camera; for a real device, yield its
-images and timestamps from `camera_images` instead, and give `Odometry` its `gavo.Camera`. If the lens has
-distortion, undistort the images with `camera.undistort` first.
+images and timestamps from `camera_images` instead, and give `Odometry` its `gavo.Camera`. `register` removes the lens
+distortion. If your images are already undistorted, give `Odometry` the `camera.rectified()`.
 """
 
 from collections.abc import Iterator

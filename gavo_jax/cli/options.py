@@ -16,7 +16,10 @@ PresetName = Literal["default", "paper", "fast", "wide"]
 
 # tyro keeps the line breaks of a docstring, so texts longer than a line are given as `help`
 
-SOURCE = "A folder of a dataset or of images (docs/sources.md), or the word synthetic: a room rendered by the package"
+SOURCE = (
+    "A folder of a dataset or of images, a ROS recording (see Sources in the project's documentation), or the word "
+    "synthetic: a room rendered by the package"
+)
 LIVE = "Also realsense: live frames of the first Intel RealSense camera that is connected"
 
 
@@ -118,7 +121,7 @@ class Run(SearchOptions, Source):
     voxel: Annotated[float, arg(metavar="M")] = 0.01
     """Side of the map's voxels, metres."""
     loops: bool = False
-    """Keep a map of keyframes and correct the trajectory when the camera returns to a place (docs/loops.md)."""
+    """Keep a map of keyframes and correct the trajectory when the camera returns to a place."""
     viewer: Literal["none", "spawn", "web", "save"] = "none"
     """Watch the search: in a window of Rerun, in a browser, or later, from run.rrd in the output folder."""
     resume: bool = False
@@ -211,7 +214,7 @@ class Experiment:
     """Run sequences x methods x presets x seeds x settings into a table of results, and report on it."""
 
     file: Annotated[Positional[str], arg(metavar="{FILE.toml,report}")]
-    """The experiment (docs/experiments.md), or the word report and a folder of results."""
+    """The experiment (see Experiments in the project's documentation), or the word report and a folder of results."""
     folder: Annotated[Positional[Path | None], arg(metavar="[DIR]", help_behavior_hint="(with report)")] = None
     """Folder of results to report on."""
     executor: Literal["local", "ray"] = "local"
@@ -241,7 +244,7 @@ class Tune:
     """Tune settings for both low drift and short time, by Optuna; the result is a Pareto front."""
 
     file: Annotated[Positional[Path], arg(metavar="FILE.toml")]
-    """The settings to tune and the sequences to tune them on (docs/experiments.md)."""
+    """The settings to tune and the sequences to tune them on (see Experiments in the project's documentation)."""
     trials: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the file's, else 50)")] = None
     """Total number of trials in the study, including those it has already."""
     storage: Annotated[str | None, arg(metavar="URL", help_behavior_hint="(default: SQLite in --output)")] = None

@@ -46,8 +46,11 @@ class Loops(NamedTuple):
     """The map of a run."""
 
     keyframes: list[Keyframe]
+    """In the order of their frames."""
     edges: list[Edge]
+    """The loops between keyframes, `earlier` and `later` being their places in the list."""
     solution: Solution
+    """The optimised graph: pose of each keyframe, weight and residual of each loop."""
 
 
 class _Uncertainty(NamedTuple):

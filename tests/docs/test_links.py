@@ -40,8 +40,10 @@ def test_the_reference_has_every_public_name() -> None:
     documented = re.findall(r"^::: gavo_jax\.([\w.]+)$", pages, re.MULTILINE)
     actors = [f"datasets.rendered.actors.{name}" for name in ("box", "figure", "Sway", "Walk", "Swing")]
     returned = ["evaluation.RelativePoseError", "evaluation.ErrorSeries", "bodies.records.Body"]
+    returned += ["odometry.metrics.RunMetrics", "mapping.mapper.Loops"]
+    taken = ["datasets.live.frames.LiveDevice"]
     public = [*names_of(gavo), *(f"solvers.{name}" for name in names_of(gavo.solvers))]
-    assert sorted(documented) == sorted([*public, *actors, *returned])
+    assert sorted(documented) == sorted([*public, *actors, *returned, *taken])
     for public in names_of(gavo):
         value = getattr(gavo, public)
         assert not callable(value) or value.__doc__, public
@@ -133,3 +135,16 @@ def test_a_page_says_so_where_a_record_is_of_a_jax_that_is_ruled_out(monkeypatch
     assert "JAX 0.10.2 is ruled out" in records.section([old])
     assert "ruled out" not in records.section([new, none])
     assert "JAX 0." in records.sources_of_summary(records.Records())
+
+
+def test_readme_marks_figures_of_another_jax(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    module = importlib.import_module("records")
+    records = module.Records()
+    timed, _ = next(records.cells("throughput", "fr1_xyz", "open3d-color", "/ opencv-rgbd"))
+    for stem, record in records.by_name.items():
+        version = "JAX 0.10.2" if record is timed else "JAX 0.10.1"
+        records.by_name[stem] = record._replace(versions=re.sub(r"JAX [\d.]+", version, record.versions))
+    row = next(row for row in module.summary(records).rows if row[0] == "Open3D colour")
+    assert [cell.endswith(" †") for cell in row] == [False] * (len(row) - 1) + [True]
+    assert module.sources_of_summary(records) == "Measured with JAX 0.10.1; † with JAX 0.10.2, which is ruled out."

@@ -13,6 +13,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args
 
+import cv2
+import numpy as np
 import pytest
 import tyro
 from pages import PAGES, ROOT, blocks, commands, inline_commands, name
@@ -47,7 +49,17 @@ def sequences(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (own / f"{kind}.txt").unlink()
         for number, file in enumerate(sorted((own / kind).iterdir())):
             file.rename(own / kind / f"{number:04}.png")
+    write_video(folder / "colour.mp4")
     return folder
+
+
+def write_video(path: Path) -> None:
+    """Three frames of 640 x 480, which differ."""
+    images = np.random.default_rng(0).integers(0, 255, (3, 30, 40, 3), np.uint8)
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (640, 480))
+    for image in images:
+        video.write(cv2.resize(image, (640, 480)))
+    video.release()
 
 
 @pytest.fixture
@@ -80,6 +92,7 @@ def test_blocks_of_python_run(page: Path, small: None, sequences: Path, monkeypa
     names: dict[str, Any] = {"__name__": "page"}
     for block in blocks(page, "python"):
         exec(compile("\n" * (block.line - 1) + block.code, str(page), "exec"), names)
+    assert page.stem != "sources" or "step" in names, "the loop over the video had no frame"
 
 
 @pytest.mark.parametrize("page", WITH_SETTINGS, ids=name)
