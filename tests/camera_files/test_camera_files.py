@@ -398,6 +398,45 @@ def test_two_cameras(tmp_path, place):
     np.testing.assert_allclose(found.color_T_depth, COLOR_T_DEPTH, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "is_depth_first"),
+    [
+        ("/camera/infra1/image_rect_raw", "/camera/color/image_raw", True),
+        ("/camera/ir/image_raw", "/camera/rgb/image_raw", True),
+        ("/k4a/depth/image", "/k4a/Colour/image", True),
+        ("/camera/color/image_raw", "/camera/infra1/image_rect_raw", False),
+        ("/first/image", "/second/image", False),
+        ("/first/image", "/depth/image", False),
+        ("/depth_to_rgb/left", "/right", False),
+    ],
+)
+def test_the_topics_of_two_cameras_say_which_is_of_colour(tmp_path, first, second, is_depth_first):
+    """The first camera counted as that of colour, whatever its topic."""
+    text = kalibr("radtan", RADTAN, True).replace("500.0, 510.0", "580.0, 590.0", 1)
+    text = text.replace("/camera/image", first, 1).replace("/camera/image\n  T", f"{second}\n  T")
+    (path := tmp_path / "rig.yaml").write_text(text)
+    found = load_calibration(path)
+    assert found.depth is not None and found.color_T_depth is not None
+    cameras = (found.depth, found.color) if is_depth_first else (found.color, found.depth)
+    assert [camera.fx for camera in cameras] == [580, 500]
+    second_T_first = np.linalg.inv(COLOR_T_DEPTH)
+    expected = second_T_first if is_depth_first else COLOR_T_DEPTH
+    np.testing.assert_allclose(found.color_T_depth, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [("/infra1/image", "/infra2/image"), ("/ir/image", "/image"), ("/rgb/left", "/rgb/right")]
+)
+def test_two_cameras_of_one_kind_are_refused(tmp_path, first, second):
+    """Of two infrared cameras, the first counted as that of colour."""
+    text = kalibr("radtan", RADTAN, True).replace("/camera/image", first, 1)
+    (path := tmp_path / "rig.yaml").write_text(text.replace("/camera/image\n  T", f"{second}\n  T"))
+    with pytest.raises(
+        GavoError, match=rf"rig\.yaml: cam0 and cam1 are {first} and {second}: expected colour and depth"
+    ):
+        load_calibration(path)
+
+
 def rig(pose: object) -> str:
     return TOML + f"colour_T_depth = {pose}\n[depth]\n{TOML}"
 
