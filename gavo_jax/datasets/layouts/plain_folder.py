@@ -114,7 +114,7 @@ class PlainFolder(FileSequence):
         found = truth_in(path, [entry.stamp for entry in paired.entries], paired.counted, paired.times)
         if found is not None or not (path / TRANSFORMS).is_file():
             return found, []
-        return read_transforms(path / TRANSFORMS, {entry.color.stem: entry.stamp for entry in paired.entries})
+        return read_transforms(path / TRANSFORMS, {entry.color: entry.stamp for entry in paired.entries})
 
 
 class Open3DFolder(PlainFolder):
