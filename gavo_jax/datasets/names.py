@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gavo_jax.datasets.clocks import (
+    DIGITS_OF_A_CLOCK,
     INTERVALS,
     UNITS,
     USUAL,
@@ -25,9 +26,6 @@ from gavo_jax.errors import GavoError
 
 MOST_DIGITS = 15
 """Most digits of a frame number: floats cannot represent longer ones exactly."""
-
-DIGITS_OF_A_CLOCK = 10
-"""Fewest digits of a clock: those of seconds since 1970; finer units have more."""
 
 FEWEST = 10
 """Fewest images of each kind (or poses and images), numbered without gaps, for which differing ranges of numbers are

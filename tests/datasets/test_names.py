@@ -156,6 +156,21 @@ def test_since_a_device_was_switched_on_microseconds_may_be_of_every_tenth_frame
     np.testing.assert_allclose(np.diff(found), 1e-6 * step)
 
 
+@pytest.mark.parametrize("step", [1_300_000, 2_200_000, 7_000_000])
+def test_long_numbers_in_slow_steps_are_microseconds(step):
+    """Beyond 1 s they counted as frame numbers, or, beyond 2 s, as nanoseconds at hundreds of frames per second."""
+    found = stamps([str(110565131966 + step * i + 7919 * i % 1000) for i in range(8)])
+    assert found is not None
+    np.testing.assert_allclose(np.diff(found), 1e-6 * step, atol=2e-3)
+    assert stamps([str(1000000 + step * i) for i in range(8)]) is None
+
+
+def test_nanoseconds_keep_the_rate_of_fast_cameras():
+    found = stamps([str(110565131966 + 8333333 * i) for i in range(8)])
+    assert found is not None
+    np.testing.assert_allclose(np.diff(found), 1 / 120, atol=1e-5)
+
+
 def test_stamps_of_windows_count_from_1970():
     for name in ("ticks of Windows", "ticks of .NET"):
         found = stamps(STAMPS[name])

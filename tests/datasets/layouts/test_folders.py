@@ -263,6 +263,21 @@ def test_numbers_of_a_camera_in_another_order_are_refused(tmp_path, row):
         load_calibration(tmp_path / "k.txt", (640, 480))
 
 
+@pytest.mark.parametrize("step", [0.05, 1.3, 2.2, 9.0])
+def test_polycams_names_are_microseconds_at_any_rate(folder, step):
+    """Frames more than 1 s apart counted as numbered, or, beyond 2 s, as nanoseconds."""
+    wrote(folder, "polycam")
+    stamps = {round(stamp * 1e6): round((7.0 + step * i) * 1e6) for i, stamp in enumerate(POLYCAM_STAMPS)}
+    for file in list(folder.glob("*/*")):
+        file.rename(file.with_name(f"{stamps[int(file.stem)]}{file.suffix}"))
+    (folder / f"depth/{max(stamps.values())}.png").unlink()
+    sequence = open_source(folder)
+    assert isinstance(sequence, FileSequence) and not sequence.times_guessed
+    np.testing.assert_allclose(sequence.timestamps, 7.0 + step * np.arange(3))
+    assert sequence.ground_truth is not None and len(sequence.ground_truth) == 3
+    assert sequence.left_out == ("1 colour images: no depth image with the same name",)
+
+
 @pytest.mark.parametrize(
     "name",
     [
