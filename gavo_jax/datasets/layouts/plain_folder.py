@@ -40,6 +40,8 @@ class PlainFolder(FileSequence):
 
     kind: ClassVar[str] = "folder of colour and depth images"
     scale_is_open: ClassVar[bool] = True
+    DEPTH_SCALE: ClassVar[float] = MILLIMETRES
+    """Depth units per metre, if a camera file does not state them."""
     depth_is_of_view: ClassVar[bool] = False
     """As in `NumberedFolder`; it is also assumed if there is a `transforms.json`."""
     ESTIMATES: ClassVar[str] = ""
@@ -58,7 +60,7 @@ class PlainFolder(FileSequence):
         Raises:
             GavoError: there is none.
         """
-        load = partial(load_calibration, size=partial(size_of_most, entries), depth_scale=MILLIMETRES)
+        load = partial(load_calibration, size=partial(size_of_most, entries), depth_scale=cls.DEPTH_SCALE)
         file = nearest_camera_file(path)
         return preset_or_export(path, load) if file is None else load(file)
 
@@ -76,7 +78,7 @@ class PlainFolder(FileSequence):
         usual = reading.rate or (film and rate_of(film)) or RATE
         paired = cls.pair(path, color, depth, reading, clock.seconds or (lambda numbers: numbers / usual))
         own = partial(cls.calibrate, path, paired.entries, reading)
-        calibration = reading.calibration(own, partial(size_of_most, paired.entries), MILLIMETRES)
+        calibration = reading.calibration(own, partial(size_of_most, paired.entries), cls.DEPTH_SCALE)
         if cls.depth_is_of_view or (path / TRANSFORMS).is_file():
             calibration = calibration.with_depth_of_size(*depth_size_of_most(paired.entries))
         truth, unread = cls.truth(path, paired)
