@@ -932,6 +932,27 @@ def test_a_camera_of_colour_is_found_and_that_of_depth_has_to_agree(folder, name
         open_source(folder / "scene")
 
 
+@pytest.mark.parametrize("name", ["intrinsic.txt", "cam_K.txt", "K.txt"])
+def test_a_matrix_by_its_short_names_is_the_camera(folder, name):
+    """It was not found; other camera files go before it."""
+    wrote(folder, "plain")
+    (folder / name).write_text("140 0 79.5\n0 140 59.5\n0 0 1\n")
+    assert open_source(folder).camera.fx == 131
+    (folder / "camera.yaml").unlink()
+    assert open_source(folder).camera.fx == 140
+
+
+@pytest.mark.parametrize("name", ["rgb_intrinsics.txt", "Calib_left.yaml", "K_rgb.txt", "my_camera.JSON"])
+def test_a_file_that_may_be_the_cameras_is_named(folder, name):
+    """Nothing told that it had been seen."""
+    wrote(folder, "plain")
+    (folder / "camera.yaml").rename(folder / name)
+    for other in ("camera_poses.txt", "calibration.pdf", "Kitchen.txt", "extrinsics_cam.txt"):
+        (folder / other).touch()
+    with pytest.raises(GavoError, match=rf"no camera file in it, .*; if it is in {name}: --camera .*/{name}$"):
+        open_source(folder)
+
+
 def test_the_camera_of_record3d_is_found_and_no_other_metadata(folder):
     wrote(folder, "plain")
     (folder / "camera.yaml").unlink()
