@@ -25,6 +25,7 @@ from gavo_jax.errors import (
     write_bytes,
 )
 from gavo_jax.se3 import is_rigid
+from gavo_jax.trajectory_columns import named_poses
 
 MAX_GAP = 0.1
 """Longest stretch between two samples, in seconds, that `Trajectory.interpolate` bridges unless told otherwise."""
@@ -153,20 +154,18 @@ class Trajectory:
         """Read a file of `timestamp tx ty tz qx qy qz qw` rows (camera to world), `#` comments.
 
         If a comment or a first row names the columns with qw before qx, as EuRoC's does, quaternions are read in that
-        order. A comment of `segment_comment` begins a segment. Rows are sorted by their stamps; of rows with equal
-        stamps the first is kept. Quaternions are normalised. Rows with a zero quaternion or numbers that are not finite
-        are left out, as trackers write them where they lost their markers. A `GavoWarning` says how many, and how many
-        rows of equal stamps are at different places.
+        order. Of a table with more columns, those of the pose are read (`named_poses`). A comment of `segment_comment`
+        begins a segment. Rows are sorted by their stamps; of rows with equal stamps the first is kept. Quaternions are
+        normalised. Rows with a zero quaternion or numbers that are not finite are left out, as trackers write them
+        where they lost their markers. A `GavoWarning` says how many, and how many rows of equal stamps are at different
+        places.
 
         Raises:
             GavoError: unreadable or empty file, or a row (named as file:line) that is malformed or absurdly large; no
                 row has a pose.
         """
         text = read_text(path)
-        heading, all_places = without_heading(rows_of(text, path))
-        order = _order_of(heading, path)
-        if comment := _TURN_FIRST.search(text):
-            raise GavoError(f"{path}: {comment[0][:100]}: expected {COLUMNS}")
+        all_places, is_w_first = _rows_of(text, path)
         parsed = [_parse_tum_row(place, fields) for place, fields in all_places]
         if not parsed:
             raise GavoError(f"{path}: contains no trajectory (no rows)")
@@ -178,7 +177,7 @@ class Trajectory:
             warnings.warn(f"{path}: {lost} of {len(parsed)} rows left out: {NO_POSE}", GavoWarning, stacklevel=2)
         segments = _segments_of(text, [int(place.rpartition(":")[2]) for place, _ in places])
         table = np.array(rows)
-        if order == W_FIRST_ORDER or W_FIRST.search(text):
+        if is_w_first:
             table[:, 4:] = np.roll(table[:, 4:], -1, axis=1)
         _, first, kept = np.unique(table[:, 0], return_index=True, return_inverse=True)
         apart = np.linalg.norm(table[:, 1:4] - table[first[kept.reshape(-1)], 1:4], axis=1)
@@ -410,6 +409,21 @@ def _slerp(
     weight_start = np.where(small, 1 - fraction, np.sin((1 - fraction) * angle) / safe)
     weight_end = np.where(small, fraction, np.sin(fraction * angle) / safe)
     return weight_start * start + weight_end * end
+
+
+def _rows_of(text: str, path: str | Path) -> tuple[list[tuple[str, list[str]]], bool]:
+    """Split a trajectory file into rows, with their places; and tell whether quaternions begin with w.
+
+    Raises:
+        GavoError: the columns are named, and are not those of a pose.
+    """
+    if (named := named_poses(text, path)) is not None:
+        return named, False
+    heading, rows = without_heading(rows_of(text, path))
+    order = _order_of(heading, path)
+    if comment := _TURN_FIRST.search(text):
+        raise GavoError(f"{path}: {comment[0][:100]}: expected {COLUMNS}")
+    return rows, order == W_FIRST_ORDER or W_FIRST.search(text) is not None
 
 
 def _order_of(heading: list[str], path: str | Path) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax.camera_files.words import Table, numbers_of, rest_of_camera
+from gavo_jax.camera_files.words import Table, numbers_of, refuse_unknown, rest_of_camera, unit_of_depth
 from gavo_jax.errors import GavoError, shown
 
 Rays = tuple[np.ndarray, np.ndarray]
@@ -155,12 +155,12 @@ def read_nerfstudio(path: Path, values: Table) -> Table:
             f"{path}: an angle of view alone: write fl_x = w / (2 tan(camera_angle_x / 2)), cx, cy, w and h"
         )
     table = {"fx": values["fl_x"], "fy": values.get("fl_y", values["fl_x"]), "cx": values["cx"], "cy": values["cy"]}
-    table |= next(({"depth_scale": 1 / values[key]} for key in NERF_UNITS if values.get(key)), {})
     if any(numbers_of(values.get("distortion_params"))):
         raise GavoError(
             f"{path}: distortion_params: their order is not certain: write them as k1, k2, p1 and p2, or k1 to k4 of a "
             "fisheye"
         )
+    table |= _nerf_unit(str(path), values)
     is_fisheye = values.get("is_fisheye")  # instant-ngp's word for it
     model = values.get("camera_model", "OPENCV_FISHEYE" if is_fisheye else "OPENCV")
     if is_fisheye and model != "OPENCV_FISHEYE":
@@ -173,6 +173,14 @@ def read_nerfstudio(path: Path, values: Table) -> Table:
         )
     lens = [values.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
     return {**table, **size, **({"distortion": lens} if any(lens) else {})}
+
+
+def _nerf_unit(place: str, values: Table) -> Table:
+    """The unit of depth by NeRF's names, else by those of other programs; empty if there is none."""
+    rest = {key: value for key, value in values.items() if key not in (*NERF_UNITS, "distortion_params")}
+    refuse_unknown(place, rest)
+    told = next(({"depth_scale": 1 / values[key]} for key in NERF_UNITS if values.get(key)), {})
+    return told or unit_of_depth(place, rest)
 
 
 def _nerf_cameras(values: Table) -> list[Table]:

@@ -22,6 +22,7 @@ from gavo_jax.camera_files.exports import (
     read_realsense,
 )
 from gavo_jax.camera_files.foreign import hint_of_text, refuse_bop_camera, refuse_foreign
+from gavo_jax.camera_files.kalibr import is_kalibr, is_one_of_kalibr, read_kalibr, read_one_of_kalibr
 from gavo_jax.camera_files.storage import read_storage, real_of, values_of
 from gavo_jax.camera_files.words import (
     CAMERA_KEYS,
@@ -163,28 +164,6 @@ def _read_ros(path: Path, values: Table) -> Table:
     }
 
 
-def _read_kalibr(path: Path, values: Table) -> Table:
-    """Looks like Kalibr's camera chain."""
-    color = _kalibr_camera(path, values["cam0"])
-    if "cam1" not in values:
-        return color
-    depth_T_color = np.array(values["cam1"]["T_cn_cnm1"], float)
-    return {
-        **color,
-        "depth": _kalibr_camera(path, values["cam1"]),
-        "colour_T_depth": np.linalg.inv(depth_T_color).tolist(),
-    }
-
-
-def _kalibr_camera(path: Path, values: Table) -> Table:
-    """Looks like a camera of Kalibr or of EuRoC."""
-    if values.get("camera_model", "pinhole") != "pinhole":
-        raise GavoError(f"{path}: camera_model {shown(values['camera_model'])}: only pinhole is supported")
-    (fx, fy, cx, cy), (width, height) = values["intrinsics"], values["resolution"]
-    size = {"width": width, "height": height}
-    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **size, **rest_of_camera(str(path), values)}
-
-
 def _read_vins(path: Path, values: Table) -> Table:
     """Looks like a camera of VINS."""
     return {**{key: values["projection_parameters"][key] for key in FOCAL}, **rest_of_camera(str(path), values)}
@@ -213,14 +192,6 @@ def _is_ros(values: Table) -> bool:
     return first(values, MATRIX) is not None
 
 
-def _is_kalibr(values: Table) -> bool:
-    return "cam0" in values
-
-
-def _is_one_of_kalibr(values: Table) -> bool:
-    return isinstance(values.get("intrinsics"), list) and "resolution" in values
-
-
 def _is_vins(values: Table) -> bool:
     return isinstance(values.get("projection_parameters"), dict)
 
@@ -233,8 +204,8 @@ MAKES: tuple[tuple[Callable[[Table], bool], Callable[[Path, Table], Table]], ...
     (_is_open3d, _read_open3d),
     (_is_nested, _read_nested),
     (_is_ros, _read_ros),
-    (_is_kalibr, _read_kalibr),
-    (_is_one_of_kalibr, _kalibr_camera),
+    (is_kalibr, read_kalibr),
+    (is_one_of_kalibr, read_one_of_kalibr),
     (_is_vins, _read_vins),
     (is_openloris, read_openloris),
     (is_realsense, read_realsense),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gavo_jax.camera import DISTORTION_COUNTS
-from gavo_jax.errors import GavoError
+from gavo_jax.errors import GavoError, shown
 
 Table = dict[str, Any]
 
@@ -41,6 +41,15 @@ IS_FISHEYE = ("fisheye", "fisheyemodel", "isfisheye")
 UNIT = ("depthscale", "depthfactor", "pngdepthscale", "depthmapfactor")
 """Names of raw depth units per metre, or of metres per unit."""
 
+METRES_PER_UNIT = ("depthunits", "depthunit")
+"""Names of metres per raw depth unit, or of the unit's name."""
+
+UNITS_BY_NAME = {
+    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1000.0),
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1.0),
+}
+"""Raw depth units per metre, by the unit's name."""
+
 WIDTH, HEIGHT, SIZE = ("width", "imagewidth", "w"), ("height", "imageheight", "h"), ("imagesize", "resolution")
 """Names of the image's width, of its height and of both, pixels."""
 
@@ -53,7 +62,7 @@ LEAST_UNITS = 0.05
 ORDER = {"pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), "fisheye": ("k1", "k2", "k3", "k4")}
 """Order of OpenCV's distortion coefficients, by model."""
 
-LOOKS_LIKE_A_LENS = re.compile(r"distort|^dist(?!ance)|fisheye|^depth.*(scale|factor)")
+LOOKS_LIKE_A_LENS = re.compile(r"distort|^dist(?!ance)|fisheye|^depth.*(scale|factor|unit)")
 
 MODELS = {
     "pinhole": "pinhole",
@@ -109,15 +118,15 @@ def rest_of_camera(place: str, values: Table) -> Table:
     Raises:
         GavoError: an unknown name looks like distortion or a depth unit.
     """
-    _refuse_unknown(place, values)
+    refuse_unknown(place, values)
     copied = {key: values[key] for key in COPIED_KEYS if key in values}
-    return {**_size(values), **_lens(values), **_unit(values), **copied}
+    return {**_size(values), **_lens(values), **unit_of_depth(place, values), **copied}
 
 
 def known(key: str) -> bool:
     """Whether `rest_of_camera` reads a name."""
-    words = (*LENS, *LENS_MODEL, *ANY_MODEL, *IS_FISHEYE, *UNIT, *WIDTH, *HEIGHT, *SIZE, *ORDER["pinhole"])
-    return plain(key) in words or key in COPIED_KEYS
+    lens, units = (*LENS, *LENS_MODEL, *ANY_MODEL, *IS_FISHEYE, *ORDER["pinhole"]), (*UNIT, *METRES_PER_UNIT)
+    return plain(key) in (*lens, *units, *WIDTH, *HEIGHT, *SIZE) or key in COPIED_KEYS
 
 
 def camera_info_distortion(model: str, coefficients: list[Any]) -> Table:
@@ -158,14 +167,30 @@ def _size(values: Table) -> Table:
     return {key: value for key, value in (("width", width), ("height", height)) if value is not None}
 
 
-def _unit(values: Table) -> Table:
+def unit_of_depth(place: str, values: Table) -> Table:
+    """Read the unit of depth into our key; empty if there is none.
+
+    Raises:
+        GavoError: it may be either of metres per unit and units per metre, or is an unknown name.
+    """
     unit = first(values, UNIT)
+    if unit is None and (told := first(values, METRES_PER_UNIT)) is not None:
+        is_metres = isinstance(told, int | float) and 0 < told < LEAST_UNITS
+        unit = told if is_metres else UNITS_BY_NAME.get(str(told).strip().lower())
+        if unit is None:
+            fault = f"expected metres per unit, below {LEAST_UNITS:g}, or mm or m, found {shown(told)}"
+            raise GavoError(f"{place}: the unit of depth: {fault}: write depth_scale, in units per metre")
     if isinstance(unit, int | float) and 0 < unit < LEAST_UNITS:
         unit = 1 / unit
     return {} if unit is None else {"depth_scale": unit}
 
 
-def _refuse_unknown(place: str, values: Table) -> None:
+def refuse_unknown(place: str, values: Table) -> None:
+    """Refuse unknown names that look like distortion or a depth unit.
+
+    Raises:
+        GavoError: there is one with a value other than 0.
+    """
     for key, value in values.items():
         if known(key) or not LOOKS_LIKE_A_LENS.search(plain(key)) or isinstance(value, bool | str):
             continue

@@ -21,7 +21,7 @@ from gavo_jax.cli.selection import (
 )
 from gavo_jax.datasets.assembly import recorded_as
 from gavo_jax.datasets.base import Sequence
-from gavo_jax.datasets.depth_unit import unit_of_file
+from gavo_jax.datasets.depth_unit import doubt_of_guess, unit_of_file
 from gavo_jax.datasets.live.devices import is_live
 from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED, LOST
@@ -95,9 +95,7 @@ def run(options: Run) -> int:
             else:
                 _go_on(progress, sequence, odometry, folder, viewer, mapper)
             say(summary(sequence))
-            if line := left_out_in_short(sequence):
-                say(f"{line}; metrics.json says why (left_out)")
-            if line := settings_line(options):
+            for line in _remarks(options, sequence):
                 say(line)
             metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer, mapper)
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
@@ -115,6 +113,16 @@ def run(options: Run) -> int:
         return INTERRUPTED
     viewer.stay()
     return LOST if options.strict and metrics["lost_pairs"] else 0
+
+
+def _remarks(options: Run, sequence: Sequence) -> Iterator[str]:
+    """Yield a line for what of the source is not used, a guessed unit of depth in doubt, and the settings."""
+    if line := left_out_in_short(sequence):
+        yield f"{line}; metrics.json says why (left_out)"
+    if line := doubt_of_guess(sequence):
+        yield f"depth in doubt: {line}"
+    if line := settings_line(options):
+        yield line
 
 
 def _doubts(trajectory: Trajectory, truth: Trajectory, units: float) -> Iterator[str]:

@@ -30,7 +30,11 @@ INTERVALS = (2e-3, 10.0)
 """Range of possible frame intervals, seconds."""
 
 DEVICE_INTERVALS = (2e-3, 1.0)
-"""Range of frame intervals of stamps since device start, seconds, where only the steps indicate the unit."""
+"""Range of frame intervals of stamps since device start, seconds, where only the steps indicate the unit. Longer ones
+are accepted in numbers with the digits of a clock, shorter ones than those of nearly every camera only in poses."""
+
+DIGITS_OF_A_CLOCK = 10
+"""Fewest digits of a clock: those of seconds since 1970; finer units have more."""
 
 MILLISECONDS, JITTER = (5, 200), 0.3
 """Range of steps that may be milliseconds, and the deviation from their median, relative to it, that is jitter. The
@@ -63,18 +67,24 @@ def _ticks_before(counts: Sequence[float]) -> int:
     return next(starts, 0)
 
 
-def unit_of(counts: Sequence[float]) -> float | None:
+def unit_of(counts: Sequence[float], shortest: float = USUAL[0]) -> float | None:
     """The unit of whole numbers, seconds, if they count time; None if they seem to be frame numbers.
 
     Ticks of 100 ns are recognised in calendar times only: since device start they look like microseconds of every
     tenth frame.
+
+    Args:
+        counts: The numbers.
+        shortest: Shortest interval, seconds, of nanoseconds since device start: shorter ones are slow microseconds.
     """
     if not counts or len(set(map(float, counts))) < len(set(counts)):
         return None
     of_clock = clock_unit(counts)
     if of_clock and is_between([of_clock * count for count in counts], INTERVALS):
         return of_clock
-    device = [unit for unit in UNITS[2:] if _steps_are(DEVICE_INTERVALS, unit, counts)]
+    readings = ((UNITS[2], DEVICE_INTERVALS), (UNITS[3], (shortest, DEVICE_INTERVALS[1])), (UNITS[2], INTERVALS))
+    are_long = min(counts) >= 10 ** (DIGITS_OF_A_CLOCK - 1)
+    device = [unit for unit, bounds in readings[: 3 if are_long else 2] if _steps_are(bounds, unit, counts)]
     if _are_milliseconds(np.diff(sorted(counts))):
         device.append(UNITS[1])
     return device[0] if device else of_clock

@@ -56,6 +56,10 @@ USUAL_MEDIAN = 1.5
 STEP_TOLERANCE = 0.15
 """Relative tolerance between the scale estimated from the steps and a common one."""
 
+NEAR = 2.0
+"""Farthest depth, metres, below which a unit finer than millimetres that is only a guess is doubted: rooms reach
+farther."""
+
 LEAST_STEP = 3.5
 """Smallest step used, raw units: rounding hides the law in smaller ones."""
 
@@ -203,6 +207,31 @@ def _in_another_unit(sample: DepthSample, scale: float) -> str:
     return f"; in {named} it is {sample.median / other:.3g} m"
 
 
+def doubt_of_guess(sequence: FrameSequence, depths: list[np.ndarray] | None = None) -> str | None:
+    """Describe integer depth that is all near in a unit guessed from the layout, and what it is in millimetres.
+
+    Args:
+        sequence: The sequence.
+        depths: Its `first_depths`; None to read them.
+
+    Returns:
+        None where the unit is known, the steps of a Kinect confirm it, or depth is not all near.
+    """
+    if not getattr(sequence, "unit_is_assumed", False):
+        return None
+    sample, scale = sample_sequence(sequence, depths)
+    millimetres = COMMON[1]
+    if sample is None or not sample.is_whole or scale <= millimetres or sample.far / scale > NEAR:
+        return None
+    if _nearest_to_steps(sample, [scale]) or not USUAL[0] < sample.median / millimetres < USUAL[1]:
+        return None
+    return (
+        f"its unit is a guess, in which the farthest is {sample.far / scale:.3g} m, the median "
+        f"{sample.median / scale:.3g} m; in millimetres (--depth-scale {millimetres:g}) they are "
+        f"{sample.far / millimetres:.3g} and {sample.median / millimetres:.3g} m"
+    )
+
+
 def doubt_of_scale(sequence: FrameSequence, depths: list[np.ndarray] | None = None) -> str | None:
     """Describe a median depth that is unusual, and what it is in another unit; None where it is usual.
 
@@ -210,6 +239,8 @@ def doubt_of_scale(sequence: FrameSequence, depths: list[np.ndarray] | None = No
         sequence: The sequence.
         depths: Its `first_depths`; None to read them.
     """
+    if guess := doubt_of_guess(sequence, depths):
+        return guess
     sample, scale = sample_sequence(sequence, depths)
     if sample is None or DEPTH_RANGE[0] < sample.median / scale < DEPTH_RANGE[1]:
         return None

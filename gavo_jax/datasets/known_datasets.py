@@ -79,6 +79,19 @@ KNOWN = (
         for inside in ("", "data/")
     ),
     Known(
+        ("wide/", "highres_depth/"),
+        "ARKitScenes in high resolution: in another folder, link wide/ as lowres_wide/, highres_depth/ as "
+        "lowres_depth/, wide_intrinsics/ as lowres_wide_intrinsics/, and lowres_wide.traj",
+    ),
+    *(
+        Known(
+            patterns,
+            "a scene rendered for NeRF, whose views are not consecutive, and whose depth is a picture of 8 bits: "
+            "expected consecutive frames with depth of 16 bits or floats",
+        )
+        for patterns in (("transforms_train.json", "train/"), ("r_*.png", "r_*_depth_*.png"))
+    ),
+    Known(
         ("stereo/depth_maps/",),
         "depth maps of COLMAP's stereo, whose unit is unknown and whose images are not consecutive: expected those of "
         "an RGB-D camera",

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gavo_jax.datasets.clocks import (
+    DIGITS_OF_A_CLOCK,
     INTERVALS,
     UNITS,
     USUAL,
@@ -25,9 +26,6 @@ from gavo_jax.errors import GavoError
 
 MOST_DIGITS = 15
 """Most digits of a frame number: floats cannot represent longer ones exactly."""
-
-DIGITS_OF_A_CLOCK = 10
-"""Fewest digits of a clock: those of seconds since 1970; finer units have more."""
 
 FEWEST = 10
 """Fewest images of each kind (or poses and images), numbered without gaps, for which differing ranges of numbers are
@@ -95,15 +93,16 @@ def images_among(files: Iterable[Path], suffixes: Sequence[str]) -> list[Path]:
 def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
     """Index images by the number that distinguishes them: of those in order, the one that pairs most frames.
 
-    Numbers are counted from the end of the names, and the last is preferred. Names without a number are left out.
+    Numbers are counted from the end of the names, without those that are the same in all names of a kind (the size, or
+    the bits per pixel), and the last is preferred. Names without a number are left out.
 
     Raises:
         GavoError: no number is unique and in the order of the names, or `_check_start` fails; the message names a file.
     """
     both = [[file for file in files if _numbers(file)] for files in (color, depth)]
     others = tuple(file for file in (*color, *depth) if not _numbers(file))
-    places = range(1, 1 + min((len(_numbers(file)) for files in both for file in files), default=0))
-    found = [Found(_at(place, both[0]), _at(place, both[1]), others) for place in places]
+    places = zip(*map(_varying, both), strict=False)
+    found = [Found(_at(first, both[0]), _at(second, both[1]), others) for first, second in places]
     usable = [one for one in found if all(map(_is_in_order, one[:2], both))]
     if found and not usable:
         odd = f"{both[0][0]}: more than one number in the names varies: keep one, or use timestamps as names"
@@ -113,11 +112,21 @@ def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
     return chosen
 
 
+def _varying(files: Sequence[Path]) -> list[int]:
+    """Positions of numbers, counted from the end, that differ between some names; all positions if none does."""
+    rows = [_numbers(file)[::-1] for file in files]
+    shortest, longest = (pick(map(len, rows), default=0) for pick in (min, max))
+    places = list(range(1, 1 + shortest))
+    varying = [place for place in places if len({row[place - 1] for row in rows}) > 1]
+    return varying if varying and shortest == longest else places
+
+
 def _check_start(found: Found) -> None:
     """Refuse gapless ranges of numbers that differ at both ends, or start alike with a ratio of lengths in `RATES`.
 
     It is then ambiguous whether images pair by number or by order. Where just one camera started or stopped late, one
-    end agrees; but the starts also agree where one camera is several times as fast. Fewer than `FEWEST` images pass.
+    end agrees; but the starts also agree where one camera is several times as fast. Ranges with gaps are refused, too,
+    if both ends differ alike, and as many images pair with that shift. Fewer than `FEWEST` images pass.
     """
     color, depth, _ = found
     few, many = sorted(map(len, (color, depth)))
@@ -126,7 +135,9 @@ def _check_start(found: Found) -> None:
     (a, b), (c, d) = ((min(images), max(images)) for images in (color, depth))
     are_whole = b - a + 1 == len(color) and d - c + 1 == len(depth)
     are_of_two_rates = a == c and any(abs(many - few * rate) <= rate for rate in RATES)
-    if are_whole and (a != c and b != d or are_of_two_rates):
+    shifted = {n - c + a for n in depth}
+    is_shifted = a - c == b - d != 0 and len(color.keys() & shifted) >= len(color.keys() & depth.keys())
+    if is_shifted or are_whole and (a != c and b != d or are_of_two_rates):
         raise GavoError(
             f"{color[a]}: colour images are {a} to {b}, depth images {c} to {d}: give those of one frame the "
             "same number, or remove those without a partner"

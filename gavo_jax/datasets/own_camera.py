@@ -7,6 +7,7 @@ from typing import Any
 
 from gavo_jax.camera import preset_for_sequence
 from gavo_jax.camera_files.calibration import MAX_JSON_BYTES, Calibration, load_calibration
+from gavo_jax.camera_files.makes import PARSERS
 from gavo_jax.datasets.images import read_bytes
 from gavo_jax.datasets.truth import icl_truth
 from gavo_jax.errors import GavoError, read_json_object, read_text
@@ -19,14 +20,23 @@ CAMERA_FILES = (
 )
 """Names by which a camera file in a folder, or in its parent, is recognised."""
 
+LOOKS_LIKE_A_CAMERA = re.compile(r"cam|intrinsic|calib|^K(?![a-z])", re.IGNORECASE)
+OF_POSES = re.compile(r"pose|traj|extrinsic", re.IGNORECASE)
+"""Matches other files whose names contain the camera's."""
+
+MOST_NAMED = 3
+"""Most files that a message names."""
+
 SCANS, OF_A_SCAN = ("info.txt", "_info.txt"), b"m_calibrationColorIntrinsic"
 """Names of a scan's info file, and a key that it contains: other programs use the same names."""
 
 EXPORTED_CAMERA_FILES = (
+    *("cam_K.txt", "K.txt", "intrinsic.txt"),
     *(f"intrinsics{ending}" for ending in (".toml", ".yaml", ".yml", ".json")),
     *("calibration.json", "camera_matrix.csv", "transforms.json", "metadata.json"),
 )
-"""Names of camera files exported by other programs, which may be estimates: used only if there is no other camera."""
+"""Names of camera files exported by other programs, which may be estimates, or of many cameras: used only if there is
+no other camera."""
 
 
 def told_in(file: Path) -> dict[str, Any]:
@@ -99,4 +109,14 @@ def preset_by_name(folder: Path) -> Calibration:
     except GavoError as error:
         if icl_truth(folder) is not None:
             return load_calibration("icl")
-        raise GavoError(f"{folder}: no camera file in it, and {error}") from None
+        raise GavoError(f"{folder}: no camera file in it, and {error}{_lookalikes(folder)}") from None
+
+
+def _lookalikes(folder: Path) -> str:
+    """Name the files in a folder that may hold its camera, for a message; empty if there are none."""
+    files = [file.name for file in sorted(folder.iterdir()) if file.suffix.lower() in PARSERS and file.is_file()]
+    alike = [name for name in files if LOOKS_LIKE_A_CAMERA.search(name) and not OF_POSES.search(name)]
+    if not alike:
+        return ""
+    names = ", ".join(name[:60] for name in alike[:MOST_NAMED]) + ", …" * (len(alike) > MOST_NAMED)
+    return f"; if it is in {names}: --camera {folder / alike[0]}"

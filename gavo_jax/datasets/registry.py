@@ -23,6 +23,7 @@ from gavo_jax.datasets.layouts.rtabmap import RtabMap
 from gavo_jax.datasets.layouts.tartanair import TartanAir
 from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.layouts.virtual_kitti import VirtualKitti
+from gavo_jax.datasets.layouts.ycb_video import YcbVideo
 from gavo_jax.datasets.recordings.bags import BagSequence
 from gavo_jax.errors import GavoError, as_path, blamed
 
@@ -74,6 +75,7 @@ BUILT_IN: tuple[Dataset, ...] = (
         NeuralRgbd,
         RtabMap,
         Nerfstudio,
+        YcbVideo,
         Open3DFolder,
         PlainFolder,
     ),

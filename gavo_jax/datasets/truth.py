@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.datasets.clocks import TICK, UNITS, clock_unit, in_seconds, unit_of
+from gavo_jax.datasets.clocks import DEVICE_INTERVALS, TICK, UNITS, clock_unit, in_seconds, unit_of
 from gavo_jax.datasets.names import FEWEST, mask_numbers
 from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.se3 import rigid
@@ -185,7 +185,7 @@ def _how_to_name(folder: Path, names: list[str]) -> str:
 def counted_in(trajectory: Trajectory) -> float:
     """The unit of a trajectory's stamps, seconds: as whole numbers at a camera's rate, or as stamps since 1970."""
     stamps = trajectory.timestamps.tolist()
-    return (_are_whole(trajectory) and unit_of(stamps)) or clock_unit(stamps) or 1.0
+    return (_are_whole(trajectory) and unit_of(stamps, DEVICE_INTERVALS[0])) or clock_unit(stamps) or 1.0
 
 
 def icl_truth(folder: Path) -> Path | None:

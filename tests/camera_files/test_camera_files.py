@@ -194,11 +194,28 @@ def test_every_make_leads_to_the_same_camera(tmp_path, name):
     assert name.endswith(".csv") or load_camera(tmp_path / name) == found.color
 
 
-@pytest.mark.parametrize("key", ["integer_depth_scale", "depth_unit_scale_factor"])
-def test_transforms_say_the_unit_of_depth_in_metres(tmp_path, key):
-    (tmp_path / "transforms.json").write_text(json.dumps({**NERF, key: 10 / 65535}))
+@pytest.mark.parametrize(
+    ("key", "unit"),
+    [
+        ("integer_depth_scale", 10 / 65535),
+        ("depth_unit_scale_factor", 10 / 65535),
+        ("depth_scale", 6553.5),
+        ("png_depth_scale", 10 / 65535),
+        ("depth_units", 10 / 65535),
+    ],
+)
+def test_transforms_say_the_unit_of_depth(tmp_path, key, unit):
+    """Except by the names of nerfstudio and instant-ngp, it was left aside without a word."""
+    (tmp_path / "transforms.json").write_text(json.dumps({**NERF, key: unit}))
     found = load_calibration(tmp_path / "transforms.json")
     assert found.states_depth_scale and found.color.depth_scale == pytest.approx(6553.5)
+
+
+def test_transforms_with_an_unknown_unit_of_depth_are_refused(tmp_path):
+    """It was left aside without a word."""
+    (tmp_path / "transforms.json").write_text(json.dumps({**NERF, "depth_factor_16": 6553.5}))
+    with pytest.raises(GavoError, match=r"transforms\.json: 'depth_factor_16': unknown, but looks like"):
+        load_calibration(tmp_path / "transforms.json")
 
 
 @pytest.mark.parametrize("place", ["top", "frames", "frames without a focal length"])
@@ -285,6 +302,9 @@ COMMON_NAMES: dict[str, tuple[str | dict[str, Any], Camera]] = {
     "delay.yaml": (ros1("plumb_bob", RADTAN) + "depth_delay: -0.02\n", BROWN),
     "factor.json": ({**K, "depth_factor": 1000}, replace(NONE, depth_scale=1000.0)),
     "metres.json": ({**K, "depth_scale": 0.001}, replace(NONE, depth_scale=1000.0)),
+    "units.json": ({**K, "depth_units": 0.00025}, replace(NONE, depth_scale=4000.0)),
+    "units of realsense.json": ({**REALSENSE, "depth_units": 0.00025}, replace(NONE, depth_scale=4000.0)),
+    "unit.yaml": (ros1("plumb_bob", RADTAN) + "depth_unit: mm\n", replace(BROWN, depth_scale=1000.0)),
     "kalibr.yaml": (kalibr("radtan", RADTAN) + "  depth_scale: 1000\n", replace(BROWN, depth_scale=1000.0)),
     "euroc.yaml": (EUROC, BROWN),
     "vins.yaml": (VINS, BROWN),
@@ -326,6 +346,9 @@ def test_a_lens_model_holds_whatever_the_coefficients_are_called(tmp_path, name,
         ({"my_distortion": RADTAN}, "'my_distortion': unknown, but looks like lens"),
         ({"dist_params": {"k1": 0.1}}, "'dist_params': unknown"),
         ({"depth_unit_scale": 0.001}, "'depth_unit_scale': unknown"),
+        ({"depth_unit_m": 0.001}, "'depth_unit_m': unknown"),
+        ({"depth_unit": 1.0}, "the unit of depth: expected metres per unit, below 0.05, or mm or m, found 1.0: write"),
+        ({"depth_units": "inch"}, "the unit of depth: expected .* found 'inch'"),
     ],
 )
 def test_what_looks_like_a_lens_and_is_not_known_is_refused(tmp_path, more, words):
@@ -396,6 +419,45 @@ def test_two_cameras(tmp_path, place):
     assert found.depth == replace(BROWN, fx=500.0 if place == "kalibr" else 580.0)
     assert found.color_T_depth is not None
     np.testing.assert_allclose(found.color_T_depth, COLOR_T_DEPTH, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "is_depth_first"),
+    [
+        ("/camera/infra1/image_rect_raw", "/camera/color/image_raw", True),
+        ("/camera/ir/image_raw", "/camera/rgb/image_raw", True),
+        ("/k4a/depth/image", "/k4a/Colour/image", True),
+        ("/camera/color/image_raw", "/camera/infra1/image_rect_raw", False),
+        ("/first/image", "/second/image", False),
+        ("/first/image", "/depth/image", False),
+        ("/depth_to_rgb/left", "/right", False),
+    ],
+)
+def test_the_topics_of_two_cameras_say_which_is_of_colour(tmp_path, first, second, is_depth_first):
+    """The first camera counted as that of colour, whatever its topic."""
+    text = kalibr("radtan", RADTAN, True).replace("500.0, 510.0", "580.0, 590.0", 1)
+    text = text.replace("/camera/image", first, 1).replace("/camera/image\n  T", f"{second}\n  T")
+    (path := tmp_path / "rig.yaml").write_text(text)
+    found = load_calibration(path)
+    assert found.depth is not None and found.color_T_depth is not None
+    cameras = (found.depth, found.color) if is_depth_first else (found.color, found.depth)
+    assert [camera.fx for camera in cameras] == [580, 500]
+    second_T_first = np.linalg.inv(COLOR_T_DEPTH)
+    expected = second_T_first if is_depth_first else COLOR_T_DEPTH
+    np.testing.assert_allclose(found.color_T_depth, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [("/infra1/image", "/infra2/image"), ("/ir/image", "/image"), ("/rgb/left", "/rgb/right")]
+)
+def test_two_cameras_of_one_kind_are_refused(tmp_path, first, second):
+    """Of two infrared cameras, the first counted as that of colour."""
+    text = kalibr("radtan", RADTAN, True).replace("/camera/image", first, 1)
+    (path := tmp_path / "rig.yaml").write_text(text.replace("/camera/image\n  T", f"{second}\n  T"))
+    with pytest.raises(
+        GavoError, match=rf"rig\.yaml: cam0 and cam1 are {first} and {second}: expected colour and depth"
+    ):
+        load_calibration(path)
 
 
 def rig(pose: object) -> str:

@@ -61,6 +61,7 @@ WITH_TIMES = (
     "rtabmap",
     "scannet_plus_plus",
     "scanner_app",
+    "polycam",
 )
 """Layouts whose frames say when they were taken."""
 
@@ -72,8 +73,8 @@ def test_run_needs_nothing_but_the_folder_and_says_which_camera(gavo, tmp_path, 
     done = gavo("run", "clip", *FAST, "--output", "out")
     assert done.status == 0, done.err
     first = done.out.splitlines()[0]
-    guesses = {"associations": "stamps are numbers", "polycam": "names taken for microseconds"}
-    rate = "" if name in WITH_TIMES else f" at 30 frames/s ({guesses.get(name, 'names are numbers')})"
+    guess = "stamps are numbers" if name == "associations" else "names are numbers"
+    rate = "" if name in WITH_TIMES else f" at 30 frames/s ({guess})"
     assert first.startswith(
         f"clip: {LAYOUTS[name][0]}, 4 frames of 160x120{rate}; camera fx 131 fy 131 cx 79.5 cy 59.5 (clip/"
     )

@@ -10,7 +10,8 @@ from written_folders import CAMERA, LAYOUTS, METRES, image, kinect, raw
 
 from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import Calibration
-from gavo_jax.datasets.depth_unit import better_scale, doubt_of_scale, sample_depth
+from gavo_jax.datasets.depth_doubts import doubt_of_depth
+from gavo_jax.datasets.depth_unit import better_scale, doubt_of_guess, doubt_of_scale, sample_depth
 from gavo_jax.datasets.files import Entry, FileSequence, Reading
 from gavo_jax.datasets.images import read_depth
 from gavo_jax.datasets.registry import open_source
@@ -114,6 +115,37 @@ def test_a_depth_that_is_unusually_near_is_set_beside_another_unit(tmp_path, sca
         image(tmp_path / f"depth/{i}.png", raw(0.5 * metres, 1000))
     doubt = doubt_of_scale(open_source(tmp_path, Reading(CAMERA, depth_scale=scale)))
     assert doubt is None if words is None else doubt and re.search(words, doubt)
+
+
+def tum_folder(folder: Path, metres: np.ndarray, scale: float, sensor=smooth, stated: str = "") -> Path:
+    image(folder / "rgb/0.png", np.full(metres.shape, 99, np.uint8))
+    image(folder / "depth/0.png", sensor(metres, scale))
+    for name in ("rgb", "depth"):
+        (folder / f"{name}.txt").write_text(f"1.000000 {name}/0.png\n")
+    (folder / "camera.toml").write_text(f"fx=260\nfy=260\ncx=159.5\ncy=119.5\nwidth=320\nheight=240\n{stated}")
+    return folder
+
+
+@pytest.mark.parametrize("is_run", [False, True])
+def test_millimetres_in_the_layout_of_tum_are_doubted(tmp_path, is_run):
+    """A room of 2 to 7 m was read as one of 0.4 to 1.4 m, without a word but that the unit is a guess."""
+    told = doubt_of_guess if is_run else doubt_of_depth
+    folder = tum_folder(tmp_path, depths(1.95, 7.0), 1000.0)
+    assert re.match(r"its unit is a guess, .* in millimetres \(--depth-scale 1000\)", told(open_source(folder)) or "")
+    assert told(open_source(folder, Reading(depth_scale=5000.0))) is None
+
+
+@pytest.mark.parametrize(
+    ("scene", "sensor", "stated"),
+    [
+        ((0.5, 1.5), kinect, ""),
+        ((1.95, 7.0), smooth, ""),
+        ((0.5, 1.5), smooth, "depth_scale=5000"),
+    ],
+)
+def test_a_unit_that_is_known_or_likely_is_not_doubted(tmp_path, scene, sensor, stated):
+    folder = tum_folder(tmp_path, depths(*scene), 5000.0, sensor, stated)
+    assert doubt_of_guess(open_source(folder)) is None
 
 
 @pytest.mark.parametrize(("reach", "is_told"), [(40.0, True), (4.0, False)])

@@ -156,6 +156,21 @@ def test_since_a_device_was_switched_on_microseconds_may_be_of_every_tenth_frame
     np.testing.assert_allclose(np.diff(found), 1e-6 * step)
 
 
+@pytest.mark.parametrize("step", [1_300_000, 2_200_000, 7_000_000])
+def test_long_numbers_in_slow_steps_are_microseconds(step):
+    """Beyond 1 s they counted as frame numbers, or, beyond 2 s, as nanoseconds at hundreds of frames per second."""
+    found = stamps([str(110565131966 + step * i + 7919 * i % 1000) for i in range(8)])
+    assert found is not None
+    np.testing.assert_allclose(np.diff(found), 1e-6 * step, atol=2e-3)
+    assert stamps([str(1000000 + step * i) for i in range(8)]) is None
+
+
+def test_nanoseconds_keep_the_rate_of_fast_cameras():
+    found = stamps([str(110565131966 + 8333333 * i) for i in range(8)])
+    assert found is not None
+    np.testing.assert_allclose(np.diff(found), 1 / 120, atol=1e-5)
+
+
 def test_stamps_of_windows_count_from_1970():
     for name in ("ticks of Windows", "ticks of .NET"):
         found = stamps(STAMPS[name])
@@ -194,9 +209,14 @@ def paths(*names: str) -> list[Path]:
         (paths("9 (1).JPG", "10 (1).JPG"), paths("0009_v2.png", "0010_v2.png")),
         (paths("9-000.jpg", "10-033.jpg"), paths("9-005.png", "10-041.png")),
         (paths("9.jpg", "10.jpg", "cover.jpg"), paths("9.png", "10.png", "legend.png")),
+        (paths("rgb_9.png", "rgb_10.png"), paths("depth_9_16bit.png", "depth_10_16bit.png")),
+        (paths("9.jpg", "10.jpg"), paths("9_640x480.png", "10_640x480.png")),
+        (paths("9_rgb.png", "10_rgb.png"), paths("9_depth_v2.png", "10_depth_v2.png")),
+        (paths("cam1_9_8bit.png", "cam1_10_8bit.png"), paths("9.png", "10.png")),
     ],
 )
 def test_the_number_that_tells_frames_apart_counts(color, depth):
+    """One that is the same in all names of a kind was set against the other kind's number of the frame."""
     found = by_number(color, depth)
     assert list(found.color) == list(found.depth) == [9, 10]
 
@@ -235,7 +255,29 @@ def test_colour_and_depth_that_count_from_other_numbers_are_refused(first, refus
         words = rf"colour images are {first[0]} to {last}, depth images {first[1]} to {first[1] + 11}: give"
         with pytest.raises(GavoError, match=words):
             by_number(some, depth)
-    assert by_number(color[:9], depth) and by_number(color[:5] + color[6:], depth)
+    assert by_number(color[:9], depth)
+
+
+@pytest.mark.parametrize(
+    ("color", "depth", "refused"),
+    [
+        (range(1, 21), [n for n in range(20) if n != 7], True),
+        ([n for n in range(21) if n != 7], range(1, 22), True),
+        (range(0, 100, 5), range(5, 105, 5), True),
+        ([n for n in range(1, 21) if n not in (7, 12)], [n for n in range(20) if n not in (7, 12)], False),
+        (range(1, 21), [n for n in range(1, 21) if n != 7], False),
+    ],
+)
+def test_a_missing_image_does_not_settle_from_which_number_the_others_count(color, depth, refused):
+    """Colour 1 to 20 and depth 0 to 19 were paired off by one where an image was missing."""
+    both = (paths(*(f"{n:03}.png" for n in numbers)) for numbers in (color, depth))
+    if not refused:
+        assert len(by_number(*both).color) == len(color)
+        return
+    with pytest.raises(
+        GavoError, match=rf"colour images are {min(color)} to {max(color)}, depth images {min(depth)} to"
+    ):
+        by_number(*both)
 
 
 @pytest.mark.parametrize(

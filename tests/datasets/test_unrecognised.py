@@ -86,6 +86,12 @@ def made(folder: Path, *names: str) -> Path:
             ("images/0.jpg", "stereo/depth_maps/0.jpg.geometric.bin"),
             "depth maps of COLMAP's stereo, whose unit is unknown",
         ),
+        (
+            ("wide/1_0.1.png", "highres_depth/1_0.1.png", "wide_intrinsics/1_0.1.pincam"),
+            "ARKitScenes in high resolution: in another folder, link wide/ as lowres_wide/",
+        ),
+        (("transforms_train.json", "train/r_0.png", "test/r_0.png"), "scene rendered for NeRF, whose views are not"),
+        (("r_0.png", "r_0_depth_0001.png", "r_0_normal_0001.png"), "scene rendered for NeRF, .* picture of 8 bits"),
         (("1.jpg", "1.png", "2.jpg", "2.png", "a.txt"), r"1\.jpg beside 1\.png: put depth into depth/, and"),
         (("frame1.jpg", "frame1.npy"), r"frame1\.jpg beside frame1\.npy: put depth into depth/"),
         (("rgb/walk.mp4", "depth/0.png"), r"no colour images in rgb \(walk\.mp4\): a film goes .*, as rgb\.mp4"),

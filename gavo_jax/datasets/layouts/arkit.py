@@ -1,5 +1,6 @@
 """Phone scans with ARKit's camera and pose of each frame in JSON files."""
 
+import re
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -12,15 +13,16 @@ from gavo_jax.camera_files.calibration import MAX_JSON_BYTES, Calibration, camer
 from gavo_jax.camera_files.exports import common_camera
 from gavo_jax.camera_files.words import REQUIRED
 from gavo_jax.datasets.assembly import MILLIMETRES
-from gavo_jax.datasets.clocks import told_stamp
+from gavo_jax.datasets.clocks import INTERVALS, is_between, told_stamp
 from gavo_jax.datasets.files import Entry, Reading, Size
 from gavo_jax.datasets.layouts.image_folders import plain_files
 from gavo_jax.datasets.layouts.nerf import FLIP, pose_of_rows
 from gavo_jax.datasets.layouts.numbered import NumberedFolder, of_matrices
-from gavo_jax.datasets.layouts.pairing import Paired
+from gavo_jax.datasets.layouts.pairing import Paired, paired_at
 from gavo_jax.datasets.layouts.plain_folder import PlainFolder
+from gavo_jax.datasets.names import unpaired
 from gavo_jax.datasets.own_camera import own_camera_file
-from gavo_jax.datasets.truth import by_stamp
+from gavo_jax.datasets.truth import Seconds, by_stamp
 from gavo_jax.errors import GavoError, read_json_object, read_text
 from gavo_jax.trajectory import Trajectory
 
@@ -114,8 +116,9 @@ class ScannerApp(NumberedFolder):
 class Polycam(PlainFolder):
     """The `keyframes/` of Polycam's raw data: `images/`, `depth/` and `cameras/`, with a JSON file for each frame.
 
-    Depth is in millimetres, registered to colour at another size. A camera's file has the intrinsics and the pose of a
-    camera that looks along -z, `t_00` to `t_23`; `corrected_cameras/`, if present, has the poses refined by the app.
+    Names count microseconds. Depth is in millimetres, registered to colour at another size. A camera's file has the
+    intrinsics and the pose of a camera that looks along -z, `t_00` to `t_23`; `corrected_cameras/`, if present, has the
+    poses refined by the app.
     """
 
     kind: ClassVar[str] = "scan of Polycam"
@@ -144,6 +147,17 @@ class Polycam(PlainFolder):
             raise GavoError(f"{folder}: contains no camera for any of these images: pass --camera")
         color = camera_from_table(folder, common_camera(str(folder), tables), MILLIMETRES)
         return Calibration(color, origin=f"{folder}, the median of {len(tables)}")
+
+    @classmethod
+    def pair(cls, path: Path, color: list[Path], depth: list[Path], reading: Reading, seconds: Seconds) -> Paired:
+        """Pair the images of the same name, which is their time; as in any folder if the names cannot be times."""
+        named = {file.stem: file for file in depth}
+        both = [file for file in color if file.stem in named and re.fullmatch(r"\d{1,15}", file.stem)]
+        stamps = [1e-6 * int(file.stem) for file in both]
+        if reading.rate or len(set(stamps)) < 2 or not is_between(stamps, INTERVALS):
+            return super().pair(path, color, depth, reading, seconds)
+        paired = paired_at(both, [named[file.stem] for file in both], stamps)
+        return paired._replace(left_out=unpaired((len(color), len(depth)), len(both), "with the same name"))
 
     @classmethod
     def truth(cls, path: Path, paired: Paired) -> tuple[Trajectory | None, list[str]]:

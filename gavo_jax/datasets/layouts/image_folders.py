@@ -37,11 +37,19 @@ Sim's Replicator."""
 DERIVED = "conf(?:idence)?|masks?|vis|preview|normals?"
 """Words in names of images that are derived from depth."""
 
+PICTURES = (
+    r"disp(?:arity|arities)?|inv(?:erse)?|vi[sz](?:uali[sz](?:ation|ed))?|colou?rmaps?|cmap|colou?ri[sz]ed|8[-_]?bit"
+)
+"""Words in names of disparity and of pictures of depth."""
+
 NO_DEPTH = re.compile(rf"(?<![a-z])(?:{DERIVED}|colou?r(?:ed)?)(?![a-z])")
 """Marks folders of images derived from depth, or about it."""
 
-OF_DEPTH = re.compile(rf"(?<![a-z])(?:{DERIVED}|colou?rmap)(?![a-z])", re.IGNORECASE)
-"""Marks files derived from depth, as `NO_DEPTH` does folders, where depth itself lies beside them."""
+OF_DEPTH = re.compile(rf"(?<![a-z])(?:{DERIVED}|{PICTURES})(?![a-z])", re.IGNORECASE)
+"""Marks files and folders derived from depth, where depth itself lies beside them."""
+
+BIT_DEPTH, PNG = 24, b"\x89PNG"
+"""Place of the bits per channel in a PNG, and its first bytes."""
 
 DEPTH_PART = re.compile(r"([-_. ]?)depth([-_. ]?)", re.IGNORECASE)
 """The part that distinguishes a depth image's name from its colour image's, where colour's has no word of its own."""
@@ -89,8 +97,13 @@ def _pairs(children: dict[str, Path]) -> list[tuple[list[Path], list[Path]]]:
     return [
         ([children[match[0]]], depth)
         for match in matches
-        if (depth := [children[name] for name in children if _is_depth_beside(match, name)])
+        if (depth := [children[name] for name in sorted(children, key=_is_derived) if _is_depth_beside(match, name)])
     ]
+
+
+def _is_derived(name: str) -> bool:
+    """Whether a name marks images derived from depth."""
+    return bool(OF_DEPTH.search(name))
 
 
 def several_pairs(path: Path) -> str | None:
@@ -122,7 +135,28 @@ def passed_over(path: Path) -> list[str]:
     for kind, some, suffixes in zip(("colour", "depth"), candidates, (COLOR_SUFFIXES, DEPTH_SUFFIXES), strict=True):
         others = [child for child in some[1:] if images_among(child.glob("*"), suffixes)]
         words += [f"{other.name}/: not read, {kind} comes from {some[0].name}/" for other in others]
+    depth = candidates[1][0]
+    if aside := sorted({*images_among(depth.glob("*"), DEPTH_SUFFIXES)} - {*_depth_in(depth)}):
+        words.append(f"{len(aside)} images in {depth.name}/: derived from depth beside them, such as {aside[0].name}")
     return words
+
+
+def _depth_in(folder: Path) -> list[Path]:
+    """Depth images in a folder: without those derived from it, and without its pictures beside arrays of it."""
+    images = images_among(folder.glob("*"), DEPTH_SUFFIXES)
+    images = [image for image in images if not _is_derived(image.name)] or images
+    arrays = {image.stem for image in images if image.suffix.lower() != ".png"}
+    return [image for image in images if image.stem not in arrays or not _is_picture(image)]
+
+
+def _is_picture(image: Path) -> bool:
+    """Whether a file is a PNG of up to 8 bits per channel."""
+    try:
+        with image.open("rb") as stream:
+            head = stream.read(BIT_DEPTH + 1)
+    except OSError:  # reported when it is decoded
+        return False
+    return head.startswith(PNG) and len(head) > BIT_DEPTH and head[BIT_DEPTH] <= 8
 
 
 def missing_images(path: Path) -> str | None:
@@ -174,12 +208,12 @@ def plain_files(path: Path) -> tuple[list[Path], list[Path]]:
     if color is not None and depth is not None:
         files = list(color.glob("*"))
         some = images_among(files, COLOR_SUFFIXES) or images_among(files, (".npy",))
-        return some, images_among(depth.glob("*"), DEPTH_SUFFIXES)
+        return some, _depth_in(depth)
     if depth is not None and (film := _film_beside(path)) is not None:
-        return frames_of(film), images_among(depth.glob("*"), DEPTH_SUFFIXES)
+        return frames_of(film), _depth_in(depth)
     files = list(path.glob("*"))
     named_depth = _with_depth(images_among(files, DEPTH_SUFFIXES))
-    depths = [file for file in named_depth if not OF_DEPTH.search(file.name)] or named_depth
+    depths = [file for file in named_depth if not _is_derived(file.name)] or named_depth
     others = sorted(set(images_among(files, COLOR_SUFFIXES)) - set(_with_depth(images_among(files, ALL_SUFFIXES))))
     named = ([file for file in others if re.search(word, file.name, re.IGNORECASE)] for word in COLOR_WORDS)
     return next(filter(None, named), _partners(others, depths)), depths

@@ -3,10 +3,11 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from gavo_jax.datasets.clocks import in_seconds, told_unit
+from gavo_jax.datasets.clocks import NAMES, clock_unit, in_seconds, told_unit
 from gavo_jax.datasets.names import by_number, stamps
 from gavo_jax.datasets.truth import Seconds
 from gavo_jax.errors import GavoError, data_rows, number
@@ -18,35 +19,44 @@ LONGEST = 40
 """Most characters of a time."""
 
 
-def listed_times(path: Path, color: Sequence[Path], depth: Sequence[Path]) -> tuple[Seconds | None, list[str]]:
+class FrameClock(NamedTuple):
+    """When the frames of a folder were taken."""
+
+    seconds: Seconds | None
+    """Maps frame numbers to times, NaN before the first and after the last; None where nothing states times."""
+    unread: Sequence[str] = ()
+    """A line for a list that is not read, with the reason."""
+    guessed: str = ""
+    """The unit guessed for times that are whole numbers without a date; empty if none was guessed."""
+
+
+def listed_times(path: Path, color: Sequence[Path], depth: Sequence[Path]) -> FrameClock:
     """Read the list of times in the folder, or in that of the colour images.
 
     A row holds a time, or a time and the name or number of a colour image, in either order. Without names, the rows are
     those of all colour images in order. Times have any form that `names.stamps` reads, or are decimal numbers.
-
-    Returns:
-        A mapping from frame numbers to seconds, NaN before the first and after the last; None if no list is read. And a
-        line for a list that is not, with the reason.
     """
     folders = dict.fromkeys((path, *(image.parent for image in color[:1])))
     file = next((folder / name for folder in folders for name in LISTS if (folder / name).is_file()), None)
     if file is None:
-        return None, []
+        return FrameClock(None)
     try:
         images = by_number(color, depth).color
     except GavoError:  # names that are times; any other fault is raised when they are paired
-        return None, []
+        return FrameClock(None)
     try:
-        times = _times_of(images, data_rows(file))
+        times, unit = _times_of(images, data_rows(file))
     except GavoError as fault:
         why = str(fault).removeprefix(f"{file}: ")
-        return None, [f"{file.name}: times are not read from it ({why}): name the images by them, or pass --rate"]
+        line = f"{file.name}: times are not read from it ({why}): name the images by them, or pass --rate"
+        return FrameClock(None, [line])
     numbers, seconds = list(times), list(times.values())
-    return lambda wanted: np.interp(wanted, numbers, seconds, np.nan, np.nan), []
+    guessed = "" if unit is None else f"{file.name} taken for {NAMES[unit]}"
+    return FrameClock(lambda wanted: np.interp(wanted, numbers, seconds, np.nan, np.nan), guessed=guessed)
 
 
-def _times_of(images: dict[int, Path], rows: list[tuple[str, list[str]]]) -> dict[int, float]:
-    """The time of each image, seconds, by its number, in order.
+def _times_of(images: dict[int, Path], rows: list[tuple[str, list[str]]]) -> tuple[dict[int, float], float | None]:
+    """The time of each image, seconds, by its number, in order; and their unit if it was guessed.
 
     Raises:
         GavoError: the rows do not give one, or the times do not increase.
@@ -55,7 +65,8 @@ def _times_of(images: dict[int, Path], rows: list[tuple[str, list[str]]]) -> dic
     if fields and not any(re.search(r"\d", field) for field in fields[0]):  # a heading
         fields = fields[1:]
     numbers, texts = _columns(images, fields)
-    times = dict(zip(numbers, _seconds(texts), strict=True))
+    seconds, unit = _seconds(texts)
+    times = dict(zip(numbers, seconds, strict=True))
     if len(times) < len(numbers):
         raise GavoError("more than one row for an image")
     if missing := images.keys() - times.keys():
@@ -63,7 +74,7 @@ def _times_of(images: dict[int, Path], rows: list[tuple[str, list[str]]]) -> dic
     times = {n: times[n] for n in sorted(images)}
     if not (np.diff(list(times.values())) > 0).all():
         raise GavoError("they do not increase from frame to frame")
-    return times
+    return times, unit
 
 
 def _columns(images: dict[int, Path], fields: list[list[str]]) -> tuple[list[int], list[str]]:
@@ -87,8 +98,8 @@ def _columns(images: dict[int, Path], fields: list[list[str]]) -> tuple[list[int
     return sorted(images), [" ".join(row) for row in fields]
 
 
-def _seconds(texts: list[str]) -> list[float]:
-    """Convert times to seconds.
+def _seconds(texts: list[str]) -> tuple[list[float], float | None]:
+    """Convert times to seconds, and return their unit if it was guessed.
 
     Raises:
         GavoError: they are no times, or whole numbers that may count frames.
@@ -99,8 +110,10 @@ def _seconds(texts: list[str]) -> list[float]:
         found = stamps(texts) if max(map(len, texts)) <= LONGEST else None
         if found is None:
             raise GavoError("its rows are no times") from None
-        return found.seconds
+        return found.seconds, None
     unit = told_unit(numbers) if np.isfinite(numbers).all() else None
     if unit is None:
         raise GavoError("its rows are no times of a known unit")
-    return in_seconds(numbers, unit)
+    seconds = in_seconds(numbers, unit)
+    is_guess = clock_unit(seconds) is None and all(stamp.is_integer() for stamp in numbers)
+    return seconds, unit if is_guess else None

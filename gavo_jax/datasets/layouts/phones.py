@@ -14,6 +14,7 @@ from gavo_jax.camera_files.calibration import Calibration, load_calibration
 from gavo_jax.datasets.assembly import MILLIMETRES
 from gavo_jax.datasets.files import Entry, Reading, Size
 from gavo_jax.datasets.layouts.image_folders import plain_files
+from gavo_jax.datasets.layouts.listed_times import FrameClock
 from gavo_jax.datasets.layouts.numbered import NumberedFolder, of_each_frame
 from gavo_jax.datasets.layouts.pairing import Paired
 from gavo_jax.datasets.layouts.plain_folder import PlainFolder, by_rate
@@ -115,13 +116,13 @@ class Record3D(PlainFolder):
         return file.is_file() and "K" in told_in(file) and super().recognises(path)
 
     @classmethod
-    def clock(cls, path: Path, color: list[Path], depth: list[Path]) -> tuple[Seconds | None, list[str]]:
+    def clock(cls, path: Path, color: list[Path], depth: list[Path]) -> FrameClock:
         """Times of the frames from `frameTimestamps`, else from `fps`."""
         told = told_in(path / cls.FILE)
         stamps = told.get("frameTimestamps")
         if isinstance(stamps, list) and len(stamps) > 1:
-            return _clock_of(f"{path / cls.FILE}: frameTimestamps", stamps), []
-        return by_rate(told.get("fps")), []
+            return FrameClock(_clock_of(f"{path / cls.FILE}: frameTimestamps", stamps))
+        return FrameClock(by_rate(told.get("fps")))
 
 
 def _clock_of(place: str, stamps: list[Any]) -> Seconds:

@@ -4,6 +4,7 @@ import contextlib
 import threading
 from collections.abc import Iterator
 from copy import copy
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar, Self, overload
@@ -18,7 +19,7 @@ from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.depth_unit import KINECTS, better_scale, sample_depth
 from gavo_jax.datasets.files import Reading, places_of_a_few
 from gavo_jax.datasets.recordings.messages import color_of, depth_of
-from gavo_jax.datasets.recordings.recording import METADATA, SUFFIXES, Bag, legible
+from gavo_jax.datasets.recordings.recording import METADATA, SENSOR, SUFFIXES, Bag, legible
 from gavo_jax.datasets.recordings.stamps import Topic, in_one_time, of_one_run, once
 from gavo_jax.datasets.recordings.topics import says_rectified
 from gavo_jax.errors import GavoError
@@ -114,6 +115,11 @@ class BagSequence:
         """Units of depth in the messages, and in frames."""
         return self._shared.assembler.unit
 
+    @property
+    def unit_is_assumed(self) -> bool:
+        """Whether the depth unit is not stated: RealSense's SDK does not follow the convention of ROS, millimetres."""
+        return bool(SENSOR.match(self._topics[1].name)) and not self.calibration.states_depth_scale
+
     def __len__(self) -> int:
         """Return the number of frames."""
         return len(self._pairs)
@@ -174,7 +180,12 @@ class BagSequence:
         own = partial(self._bag.calibration, *(topic.name for topic in self._topics))
         is_rectified = says_rectified(self._topics[0].name)
         found = reading.calibration(own, self._size, MILLIMETRES, is_rectified)  # units of 16UC1, by REP 118
-        return found if reading.depth_scale is None else found.with_depth_scale(reading.depth_scale)
+        if reading.depth_scale is not None:
+            return found.with_depth_scale(reading.depth_scale)
+        if found.states_depth_scale and found.preset is None:
+            return found
+        told = self._bag.depth_scale(self._topics[1].name)
+        return found if told is None else replace(found.with_depth_scale(told), preset=None)
 
 
 class _Shared:

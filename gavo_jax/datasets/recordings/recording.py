@@ -3,6 +3,7 @@
 import contextlib
 import io
 import itertools
+import re
 import struct
 import weakref
 from collections.abc import Callable, Iterable, Iterator
@@ -51,6 +52,12 @@ HEADER = 12
 """Bytes at the start of a message up to and including its stamp."""
 FEW = 30
 """Number of messages of a topic that are searched for a usable one."""
+SENSOR = re.compile(r"/device_\d+/sensor_\d+(?=/)")
+"""Matches the place of a sensor's topics in recordings of RealSense's SDK."""
+DEPTH_UNITS = re.compile(r"/option/depth[ _]units/value", re.IGNORECASE)
+"""Matches, below that place, the topic with the metres per unit of depth."""
+LEAST_UNIT = 1e-6
+"""Smallest unit of depth, metres."""
 ROUNDED = 0.05
 """Largest difference between two camera_infos of the same camera, pixels."""
 
@@ -142,6 +149,27 @@ class Bag:
                     "pass --colour-topic and --depth-topic if they belong to one"
                 )
         return color, depth
+
+    def depth_scale(self, depth: str) -> float | None:
+        """Units per metre of a depth topic, as RealSense's SDK records them; None if the recording does not say.
+
+        Raises:
+            GavoError: the value is no unit, or changes within the recording.
+        """
+        sensor = SENSOR.match(depth)
+        topics = [connection.topic for connection in self._reader.connections] if sensor else []
+        told = next((name for name in topics if sensor and _is_unit_of(sensor[0], name)), None)
+        if told is None:
+            return None
+        place = f"{self.path}: {told}"
+        with blamed(f"{place}: expected metres per unit"):
+            units = {float(self.deserialize(raw, kind).data) for _, raw, kind in self.stream([told])}
+        if faults := [unit for unit in units if not LEAST_UNIT < unit <= 1]:
+            hint = "pass --depth-scale, in units per metre"
+            raise GavoError(f"{place}: expected metres per unit, found {faults[0]:g}: {hint}")
+        if len(units) > 1:
+            raise GavoError(f"{place}: the unit of depth changes within the recording: pass --depth-scale")
+        return 1 / float(f"{units.pop():.6g}") if units else None  # stored as a float of 32 bits
 
     def calibration(self, color: str, depth: str) -> Calibration:
         """The cameras of two topics, from the camera_info beside each."""
@@ -244,6 +272,11 @@ class Bag:
         with blamed(place):
             table = as_taken(place, camera_table(info, says_rectified(topic)), info, partial(self.size, topic))
             return camera_from_table(place, table, MILLIMETRES)
+
+
+def _is_unit_of(sensor: str, topic: str) -> bool:
+    """Whether a topic holds the unit of depth of a sensor in a recording of RealSense's SDK."""
+    return topic.startswith(sensor) and bool(DEPTH_UNITS.fullmatch(topic.removeprefix(sensor)))
 
 
 class _File(io.BufferedReader):

@@ -263,6 +263,21 @@ def test_numbers_of_a_camera_in_another_order_are_refused(tmp_path, row):
         load_calibration(tmp_path / "k.txt", (640, 480))
 
 
+@pytest.mark.parametrize("step", [0.05, 1.3, 2.2, 9.0])
+def test_polycams_names_are_microseconds_at_any_rate(folder, step):
+    """Frames more than 1 s apart counted as numbered, or, beyond 2 s, as nanoseconds."""
+    wrote(folder, "polycam")
+    stamps = {round(stamp * 1e6): round((7.0 + step * i) * 1e6) for i, stamp in enumerate(POLYCAM_STAMPS)}
+    for file in list(folder.glob("*/*")):
+        file.rename(file.with_name(f"{stamps[int(file.stem)]}{file.suffix}"))
+    (folder / f"depth/{max(stamps.values())}.png").unlink()
+    sequence = open_source(folder)
+    assert isinstance(sequence, FileSequence) and not sequence.times_guessed
+    np.testing.assert_allclose(sequence.timestamps, 7.0 + step * np.arange(3))
+    assert sequence.ground_truth is not None and len(sequence.ground_truth) == 3
+    assert sequence.left_out == ("1 colour images: no depth image with the same name",)
+
+
 @pytest.mark.parametrize(
     "name",
     [
@@ -915,6 +930,27 @@ def test_a_camera_of_colour_is_found_and_that_of_depth_has_to_agree(folder, name
         GavoError, match=r"_color\.txt: intrinsics?_depth\.txt beside it belongs to another camera: pass --cam"
     ):
         open_source(folder / "scene")
+
+
+@pytest.mark.parametrize("name", ["intrinsic.txt", "cam_K.txt", "K.txt"])
+def test_a_matrix_by_its_short_names_is_the_camera(folder, name):
+    """It was not found; other camera files go before it."""
+    wrote(folder, "plain")
+    (folder / name).write_text("140 0 79.5\n0 140 59.5\n0 0 1\n")
+    assert open_source(folder).camera.fx == 131
+    (folder / "camera.yaml").unlink()
+    assert open_source(folder).camera.fx == 140
+
+
+@pytest.mark.parametrize("name", ["rgb_intrinsics.txt", "Calib_left.yaml", "K_rgb.txt", "my_camera.JSON"])
+def test_a_file_that_may_be_the_cameras_is_named(folder, name):
+    """Nothing told that it had been seen."""
+    wrote(folder, "plain")
+    (folder / "camera.yaml").rename(folder / name)
+    for other in ("camera_poses.txt", "calibration.pdf", "Kitchen.txt", "extrinsics_cam.txt"):
+        (folder / other).touch()
+    with pytest.raises(GavoError, match=rf"no camera file in it, .*; if it is in {name}: --camera .*/{name}$"):
+        open_source(folder)
 
 
 def test_the_camera_of_record3d_is_found_and_no_other_metadata(folder):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from written_folders import CAMERA_TOML, GREYS, METRES, image, open3d, raw
 
-from gavo_jax.datasets.files import Reading
+from gavo_jax.datasets.files import FileSequence, Reading
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.errors import GavoError
 
@@ -54,8 +54,35 @@ def test_frames_have_the_times_of_the_list(tmp_path: Path, name: str, text: str)
     (tmp_path / name).write_text(text)
     sequence = open_source(tmp_path)
     assert np.allclose(np.asarray(sequence.timestamps) - sequence.timestamps[0], STEPS, atol=2e-6)
-    assert not getattr(sequence, "times_guessed", "")
+    is_guess = text == rows("{n}", 1e6, 12.0)
+    assert getattr(sequence, "times_guessed", "") == f"{Path(name).name} taken for microseconds" * is_guess
     assert not getattr(sequence, "left_out", [])
+
+
+@pytest.mark.parametrize("start", [1e6, 3e9])
+def test_slow_times_are_no_nanoseconds(tmp_path: Path, start: float) -> None:
+    """Microseconds in steps of 2 s counted as nanoseconds, without a word; short numbers may be either."""
+    folder_of(tmp_path)
+    (tmp_path / "times.txt").write_text("".join(f"{start + 2e6 * i:.0f}\n" for i in range(len(GREYS))))
+    sequence = open_source(tmp_path)
+    assert isinstance(sequence, FileSequence)
+    is_read = start > 1e9
+    assert sequence.timestamps[1] - sequence.timestamps[0] == pytest.approx(2 if is_read else 1 / 30)
+    assert sequence.times_guessed == ("times.txt taken for microseconds" if is_read else "names are numbers")
+    assert ["its rows are no times of a known unit" in line for line in sequence.left_out] == [True] * (not is_read)
+
+
+def test_numbers_that_count_neither_frames_nor_time_are_refused(tmp_path: Path) -> None:
+    """At 30 frames per second, the frames were hours apart."""
+    for i, (grey, metres) in enumerate(zip(GREYS, METRES, strict=True)):
+        image(tmp_path / f"rgb/{20000000 + 1300017 * i}.png", grey)
+        image(tmp_path / f"depth/{20000000 + 1300017 * i}.png", raw(metres, 1000))
+    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
+    with pytest.raises(GavoError, match=r"such as 20000000\.png, are 1300017 apart: .* in a timestamps\.txt"):
+        open_source(tmp_path)
+    assert len(open_source(tmp_path, Reading(rate=1e6))) == len(GREYS)
+    (tmp_path / "timestamps.txt").write_text(rows("{t:.3f}"))
+    np.testing.assert_allclose(open_source(tmp_path).timestamps, STEPS, atol=1e-6)
 
 
 @pytest.mark.parametrize(

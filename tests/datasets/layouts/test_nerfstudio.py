@@ -175,6 +175,49 @@ def test_images_that_are_not_named_with_depth_are_told(folder):
     assert left_out(opened(folder)) == ["2 images: not listed with depth in transforms.json, such as frame_00001.png"]
 
 
+@pytest.mark.parametrize("moved", ["cam1", "/data/cam1"])
+def test_poses_are_those_of_the_images_that_are_named(folder, moved):
+    """An image of another camera with the same name gave its pose to this one."""
+    change(folder, lambda values: values["frames"].extend([{**values["frames"][0]} for _ in range(4)]))
+    for i in range(4):
+        frame = {"file_path": f"{moved}/frame_{i + 1:05}.png", "transform_matrix": np.eye(4).tolist()}
+        change(folder, lambda values, i=i, frame=frame: values["frames"].__setitem__(4 + i, frame))
+    assert check_frames(folder).left_out == ()
+
+
+def test_poses_of_images_with_the_same_name_are_not_used(tmp_path):
+    """Of two poses that may be an image's, the last counted, without a word."""
+    LAYOUTS["nerf"][1](tmp_path)
+
+    def rename(values: dict[str, Any]) -> None:
+        for frame in values["frames"]:
+            frame["file_path"] = frame["file_path"].replace("images", "cam0")
+        values["frames"].append({"file_path": "cam1/frame_00002.png", "transform_matrix": np.eye(4).tolist()})
+
+    change(tmp_path, rename)
+    sequence = open_source(tmp_path)
+    assert sequence.ground_truth is not None
+    np.testing.assert_allclose(sequence.ground_truth.world_T_camera, POSES[[0, 2, 3]], atol=1e-6)
+    why = "several of its paths end alike, such as ./cam0/frame_00002.png and cam1/frame_00002.png"
+    assert left_out(sequence) == [f"transforms.json: no poses for 1 images: {why}"]
+
+
+@pytest.mark.parametrize("name", ["rgb/1305031102.{}", "{}.png", ".", "/", "a\0b/{}"])
+def test_the_decimals_of_a_stamp_are_no_ending(tmp_path, name):
+    """Poses of rgb/1305031102.175304, without an ending, were taken to be those of no image."""
+    LAYOUTS["nerf"][1](tmp_path)
+    for i in range(4):
+        for part in ("images", "depths"):
+            (tmp_path / f"{part}/frame_{i + 1:05}.png").rename(tmp_path / f"{part}/1305031102.{i}00000.png")
+
+    def rename(frame: dict[str, Any]) -> None:
+        frame["file_path"] = name.format(f"{int(frame['file_path'][-9:-4]) - 1}00000")
+
+    change(tmp_path, each(rename))
+    sequence = open_source(tmp_path)
+    assert sequence.ground_truth is None if "rgb" not in name else len(sequence.ground_truth or ()) == 4
+
+
 def test_names_without_a_number_are_told(folder):
     (folder / "images/frame_00004.png").rename(folder / "images/last.png")
     change(folder, lambda values: values["frames"][0].update(file_path="images/last.png"))

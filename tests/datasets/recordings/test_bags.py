@@ -193,6 +193,59 @@ def test_a_recording_of_realsenses_own_tools_is_understood(tmp_path):
         open_source(tmp_path / "150.bag")
 
 
+def of_realsense(path: Path, kind: str, units: list[float], name: str = "Depth_Units") -> Path:
+    recorder = Recorder(path.with_suffix(".bag") if kind == "ros1" else path, kind)
+    for unit in units:
+        message = ("Float32", unit) if kind == "ros1" else ("String", str(unit))
+        recorder.write(f"/device_0/sensor_0/option/{name}/value", message[0], 0.5, "std_msgs", data=message[1])
+        recorder.write("/device_0/sensor_1/option/Depth_Units/value", message[0], 0.5, "std_msgs", data=message[1])
+    for stamp in (1.0, 1.1):
+        for at, sensor in enumerate(("Depth_0", "Color_0")):
+            pixels, encoding = (MILLIMETRES[0], "mono16") if at == 0 else (GREYS[0], "mono8")
+            recorder.image(f"/device_0/sensor_{at}/{sensor}/image/data", stamp, pixels, encoding, frame="0")
+            recorder.info(f"/device_0/sensor_{at}/{sensor}/info/camera_info", stamp, CAMERA, frame="")
+    recorder.close()
+    return recorder.writer.path
+
+
+@pytest.mark.parametrize(("kind", "name"), [("ros1", "Depth_Units"), ("ros1", "Depth Units"), ("mcap", "Depth_Units")])
+def test_the_unit_of_depth_is_that_of_the_device(tmp_path, kind, name):
+    """Depth of RealSense's SDK counted as millimetres whatever unit the recording states."""
+    path = of_realsense(tmp_path / "l515", kind, [0.00025, 0.00025], name)
+    sequence = open_source(path)
+    assert isinstance(sequence, BagSequence) and not sequence.unit_is_assumed
+    assert sequence.camera.depth_scale == sequence.depth_unit.file == 4000
+    assert open_source(path, Reading(camera=CAMERA)).camera.depth_scale == 4000
+    assert open_source(path, Reading(depth_scale=2000.0)).camera.depth_scale == 2000
+    file = tmp_path / "own.toml"
+    file.write_text("fx=131\nfy=131\ncx=79\ncy=60\nwidth=160\nheight=120\ndepth_scale=500\n")
+    assert open_source(path, Reading(camera=str(file))).camera.depth_scale == 500
+
+
+def test_a_unit_of_depth_that_a_device_does_not_state_is_a_guess(tmp_path):
+    """Depth of RealSense's SDK counted as known to be in millimetres, even where nothing says so."""
+    sequence = open_source(of_realsense(tmp_path / "silent", "ros1", []))
+    assert isinstance(sequence, BagSequence) and sequence.unit_is_assumed and sequence.camera.depth_scale == 1000
+    stated = open_source(tmp_path / "silent.bag", Reading(depth_scale=1000.0))
+    assert isinstance(stated, BagSequence) and not stated.unit_is_assumed
+
+
+@pytest.mark.parametrize(
+    ("units", "words"),
+    [
+        ([0.001, 0.0001], "the unit of depth changes"),
+        ([0.0], "expected metres per unit, found 0"),
+        ([1000.0], "found 1000"),
+    ],
+)
+def test_a_unit_of_depth_that_is_none_is_refused(tmp_path, units, words):
+    """Such a unit was ignored."""
+    path = of_realsense(tmp_path / "odd", "ros1", units)
+    with pytest.raises(GavoError, match=rf"Depth_Units/value: .*{words}.*pass --depth-scale"):
+        open_source(path)
+    assert open_source(path, Reading(depth_scale=1000.0)).camera.depth_scale == 1000
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_depth_of_another_camera_is_registered_by_the_recordings_transforms(tmp_path, kind):
     """Colour and depth hang on one link, turned and shifted; the chain between them is followed."""
