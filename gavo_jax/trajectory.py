@@ -1,8 +1,6 @@
 """Trajectories of a camera: TUM and KITTI files, interpolation and association by time."""
 
 import heapq
-import math
-import re
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,15 +15,12 @@ from gavo_jax.errors import (
     GavoWarning,
     as_number,
     blamed,
-    number,
     read_text,
-    rows_of,
     shown,
-    without_heading,
     write_bytes,
 )
 from gavo_jax.se3 import is_rigid
-from gavo_jax.trajectory_columns import named_poses
+from gavo_jax.trajectory_rows import NO_POSE, TRAJECTORY_HEADER, parse_row, rows_of_poses, segment_comment, segments_of
 
 MAX_GAP = 0.1
 """Longest stretch between two samples, in seconds, that `Trajectory.interpolate` bridges unless told otherwise."""
@@ -34,65 +29,6 @@ ROUNDED = 1.01
 
 SAME_PLACE = 1e-3
 """Distance in metres up to which two poses of one stamp are the same but for rounding."""
-
-MAX_MAGNITUDE = 1e9
-"""Largest absolute translation (metres) or quaternion component that a trajectory file may hold."""
-
-MAX_STAMP = 1e19
-"""Largest absolute timestamp in a trajectory file, which may count nanoseconds since 1970."""
-
-
-SHORTEST_QUATERNION = 1e-6
-"""Length below which a quaternion counts as zero."""
-
-NO_POSE = "numbers that are not finite, or a zero quaternion"
-"""What a trajectory's row holds where the tracker lost its target."""
-
-
-COLUMNS = "timestamp tx ty tz qx qy qz qw"
-
-TRAJECTORY_HEADER = f"# {COLUMNS} (camera to world, seconds and metres)"
-
-
-SEGMENT_COMMENT = re.compile(r"# segment (\d{1,9})\b")
-"""Start of the comment line before a new segment's first pose, with the segment's number from 1."""
-
-
-_APART = r"[^\w\n]+"
-W_FIRST = re.compile(
-    rf"^#.*\bq\w*w{_APART}q\w*x{_APART}q\w*y{_APART}q\w*z[^\w\n]*$", re.MULTILINE | re.IGNORECASE | re.ASCII
-)
-"""Comment that ends with the names of the last columns, w before x, as EuRoC's does."""
-
-
-_TURN_FIRST = re.compile(
-    rf"^#.*\bq\w*[wz]{_APART}(?!q)\w*x{_APART}(?!q)\w*y{_APART}(?!q)\w*z[^\w\n]*$",
-    re.MULTILINE | re.IGNORECASE | re.ASCII,
-)
-"""Comment whose columns end with the position, after the quaternion."""
-
-
-W_FIRST_ORDER = "wxyz"
-
-
-def segment_comment(segment: int, before: float | None, after: float) -> str:
-    """Return the comment line before the poses of a segment.
-
-    Args:
-        segment: its number, from 0.
-        before: stamp of the pose before, which is of another segment, seconds; None if there is none.
-        after: stamp of the first of its poses.
-    """
-    unknown = "" if before is None else f": the motion from {before:.6f} to {after:.6f} is unknown"
-    return f"# segment {segment + 1}{unknown}"
-
-
-def _segments_of(text: str, lines: list[int]) -> Int[np.ndarray, " n"]:
-    """Return the segments of the poses in the given lines of a trajectory file, counted from 1."""
-    said = [(n, SEGMENT_COMMENT.match(line)) for n, line in enumerate(text.splitlines(), 1)]
-    begun = [(n, int(match[1]) - 1) for n, match in said if match is not None and int(match[1]) > 0]
-    numbers = np.array([0] + [segment for _, segment in begun])
-    return numbers[np.searchsorted([n for n, _ in begun], lines)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +90,8 @@ class Trajectory:
         """Read a file of `timestamp tx ty tz qx qy qz qw` rows (camera to world), `#` comments.
 
         If a comment or a first row names the columns with qw before qx, as EuRoC's does, quaternions are read in that
-        order. Of a table with more columns, those of the pose are read (`named_poses`). A comment of `segment_comment`
-        begins a segment. Rows are sorted by their stamps; of rows with equal stamps the first is kept. Quaternions are
+        order. Of a table with more columns, those of the pose are read. A comment of `segment_comment` begins a
+        segment. Rows are sorted by their stamps; of rows with equal stamps the first is kept. Quaternions are
         normalised. Rows with a zero quaternion or numbers that are not finite are left out, as trackers write them
         where they lost their markers. A `GavoWarning` says how many, and how many rows of equal stamps are at different
         places.
@@ -165,8 +101,8 @@ class Trajectory:
                 row has a pose.
         """
         text = read_text(path)
-        all_places, is_w_first = _rows_of(text, path)
-        parsed = [_parse_tum_row(place, fields) for place, fields in all_places]
+        all_places, is_w_first = rows_of_poses(text, path)
+        parsed = [parse_row(place, fields) for place, fields in all_places]
         if not parsed:
             raise GavoError(f"{path}: contains no trajectory (no rows)")
         places = [place for place, row in zip(all_places, parsed, strict=True) if row is not None]
@@ -175,7 +111,7 @@ class Trajectory:
             raise GavoError(f"{all_places[0][0]}: no pose in this row or any other: {NO_POSE}")
         if lost := len(parsed) - len(rows):
             warnings.warn(f"{path}: {lost} of {len(parsed)} rows left out: {NO_POSE}", GavoWarning, stacklevel=2)
-        segments = _segments_of(text, [int(place.rpartition(":")[2]) for place, _ in places])
+        segments = segments_of(text, [int(place.rpartition(":")[2]) for place, _ in places])
         table = np.array(rows)
         if is_w_first:
             table[:, 4:] = np.roll(table[:, 4:], -1, axis=1)
@@ -409,49 +345,6 @@ def _slerp(
     weight_start = np.where(small, 1 - fraction, np.sin((1 - fraction) * angle) / safe)
     weight_end = np.where(small, fraction, np.sin(fraction * angle) / safe)
     return weight_start * start + weight_end * end
-
-
-def _rows_of(text: str, path: str | Path) -> tuple[list[tuple[str, list[str]]], bool]:
-    """Split a trajectory file into rows, with their places; and tell whether quaternions begin with w.
-
-    Raises:
-        GavoError: the columns are named, and are not those of a pose.
-    """
-    if (named := named_poses(text, path)) is not None:
-        return named, False
-    heading, rows = without_heading(rows_of(text, path))
-    order = _order_of(heading, path)
-    if comment := _TURN_FIRST.search(text):
-        raise GavoError(f"{path}: {comment[0][:100]}: expected {COLUMNS}")
-    return rows, order == W_FIRST_ORDER or W_FIRST.search(text) is not None
-
-
-def _order_of(heading: list[str], path: str | Path) -> str:
-    """Return the order of a quaternion's components by the names of the columns; empty if there are none.
-
-    Raises:
-        GavoError: they are not those of a pose in one of the two orders.
-    """
-    ends = "".join(word[-1].lower() for word in heading[1:])
-    turn_first = any(word.lower().startswith("q") for word in heading[1:4])
-    if heading and (turn_first or ends not in ("xyzxyzw", "xyz" + W_FIRST_ORDER)):
-        raise GavoError(f"{path}: columns {' '.join(heading)[:100]}: expected {COLUMNS}")
-    return ends[3:]
-
-
-def _parse_tum_row(place: str, fields: list[str]) -> list[float] | None:
-    """Parse the numbers of a row; None if they are not a pose."""
-    if len(fields) != 8:
-        raise GavoError(f"{place}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), found {len(fields)} fields")
-    try:
-        values = [number(field) for field in fields]
-    except ValueError:
-        raise GavoError(f"{place}: expected 8 numbers (timestamp tx ty tz qx qy qz qw), found text") from None
-    if not all(map(math.isfinite, values)):
-        return None
-    if max(map(abs, values[1:])) > MAX_MAGNITUDE or abs(values[0]) > MAX_STAMP:
-        raise GavoError(f"{place}: contains an absurdly large value")
-    return values if math.hypot(*values[4:]) >= SHORTEST_QUATERNION else None
 
 
 def _digits(value: float, decimals: int) -> str:

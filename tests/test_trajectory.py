@@ -18,9 +18,9 @@ from gavo_jax.trajectory import (
     inverse,
     quaternion_from_rotation,
     rotation_from_quaternion,
-    segment_comment,
     write_lines,
 )
+from gavo_jax.trajectory_rows import segment_comment
 
 GOOD = "1.0 1 2 3 0 0 0 1\n"
 

@@ -14,7 +14,8 @@ from gavo_jax.datasets.clocks import DEVICE_INTERVALS, TICK, UNITS, clock_unit, 
 from gavo_jax.datasets.names import FEWEST, mask_numbers
 from gavo_jax.errors import GavoError, data_rows, number
 from gavo_jax.se3 import rigid
-from gavo_jax.trajectory import MAX_MAGNITUDE, SHORTEST_QUATERNION, Trajectory, rotation_from_quaternion
+from gavo_jax.trajectory import Trajectory, rotation_from_quaternion
+from gavo_jax.trajectory_rows import MAX_MAGNITUDE, SHORTEST_QUATERNION
 
 TRUTH = "groundtruth.txt"
 """Name of a ground truth in TUM's format."""

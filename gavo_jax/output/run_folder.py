@@ -48,7 +48,8 @@ from gavo_jax.output.masks import MASKS, read_masks, remove_masks, write_masks
 from gavo_jax.output.motions import MOTION_COLUMNS, motion_row, with_motions
 from gavo_jax.output.seen_images import SeenImages
 from gavo_jax.status import AlignmentStatus
-from gavo_jax.trajectory import TRAJECTORY_HEADER, Trajectory, format_tum_row, segment_comment, write_lines
+from gavo_jax.trajectory import Trajectory, format_tum_row, write_lines
+from gavo_jax.trajectory_rows import TRAJECTORY_HEADER, segment_comment
 
 IDENTITY_KEYS = ("sequence", "solver", "alignment", "odometry", "device")
 IDENTITY_OPTIONS = ("method", "preset", "seed")

@@ -13,7 +13,8 @@ from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.own_camera import own_camera_file
 from gavo_jax.datasets.truth import TRUTH, Counted
 from gavo_jax.errors import GavoError, GavoWarning, read_text
-from gavo_jax.trajectory import TRAJECTORY_HEADER, Trajectory
+from gavo_jax.trajectory import Trajectory
+from gavo_jax.trajectory_rows import TRAJECTORY_HEADER
 
 ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 MARKERS = np.array(
