@@ -67,7 +67,8 @@ def test_a_map_of_something_else_is_refused() -> None:
         build_map(None, ())  # pyright: ignore[reportArgumentType]
     sequence: Any = SyntheticSequence(2, camera=CAMERA)
     other: Any = None
-    for steps in (other, [None], OdometryRun(other, [], other)):
+    none: tuple[Any, ...] = (None, [None], OdometryRun(other, [], other))
+    for steps in none:
         with pytest.raises(GavoError, match="expected the steps of a run, run.steps"):
             build_map(sequence, steps)
     with pytest.raises(GavoError, match="expected a Trajectory, got str"):

@@ -805,13 +805,14 @@ def test_an_interrupted_comparison_says_so(gavo, pristine, tmp_path, monkeypatch
 def test_a_lost_run_is_worse_than_any_other(drifts, typical):
     """With one lost run, the first seed stood in the table, though another was in the middle."""
     figures = [{compare.DRIFT: drift, compare.ROTATION_DRIFT: drift} for drift in drifts]
-    runs = [compare.Entry("ga", metrics, seed) for seed, metrics in enumerate(figures)]
+    one = Trajectory(np.zeros(1), np.eye(4)[None])
+    runs = [compare.Entry("ga", metrics, one) for metrics in figures]
     assert compare._typical_runs(runs) == [runs[typical]]
 
 
 def test_a_range_with_a_lost_run_has_no_end():
     """It spanned the runs that were left, and the figure was left out without a word."""
-    one = Trajectory([0.0], np.eye(4)[None])
+    one = Trajectory(np.zeros(1), np.eye(4)[None])
     figures = dict.fromkeys((key for _, key, _ in compare.COLUMNS), 0.02) | {"segments": 1}
     lost = figures | {compare.DRIFT: None, compare.ROTATION_DRIFT: None}
     runs = [compare.Entry("ga", metrics, one) for metrics in (lost, figures, figures)]
