@@ -1,6 +1,6 @@
 """Distance of a run's map from the depth of a frame left out of it, and a picture of the map.
 
-Tracks a clip and fuses every frame but one (by default the middle one) into a mesh (`gavo_jax.scene_map`). Prints how
+Tracks a clip and fuses every frame but one (by default the middle one) into a mesh (`gavo_jax.map_fusion`). Prints how
 far the left-out frame's depth, placed at its tracked pose, lies from the mesh. Needs the extra `[map]`.
 
     python benchmarks/map.py
@@ -20,8 +20,9 @@ from jaxtyping import Float, UInt8
 
 from gavo_jax import Camera, Frame, Reading, open_source, run_odometry
 from gavo_jax.libusb import import_open3d
+from gavo_jax.map_fusion import build_map
 from gavo_jax.output.screen import number
-from gavo_jax.scene_map import VOXEL, SceneMap, build_map
+from gavo_jax.scene_map import VOXEL, SceneMap
 from gavo_jax.trajectory import inverse
 
 FARTHEST = 4.0

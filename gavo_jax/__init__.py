@@ -45,6 +45,8 @@ from gavo_jax.errors import GavoWarning as GavoWarning
 from gavo_jax.evaluation import absolute_trajectory_error as absolute_trajectory_error
 from gavo_jax.evaluation import distance_error as distance_error
 from gavo_jax.evaluation import relative_pose_error as relative_pose_error
+from gavo_jax.map_fusion import MapBuilder as MapBuilder
+from gavo_jax.map_fusion import build_map as build_map
 from gavo_jax.objective.losses import LOSSES as LOSSES
 from gavo_jax.odometry.driver import Odometry as Odometry
 from gavo_jax.odometry.driver import Step as Step
@@ -55,9 +57,7 @@ from gavo_jax.odometry.stream import track as track
 from gavo_jax.output.trajectories import write_trajectory as write_trajectory
 from gavo_jax.presets import preset as preset
 from gavo_jax.presets import register as register
-from gavo_jax.scene_map import MapBuilder as MapBuilder
 from gavo_jax.scene_map import SceneMap as SceneMap
-from gavo_jax.scene_map import build_map as build_map
 from gavo_jax.settings import AlignmentOptions as AlignmentOptions
 from gavo_jax.settings import OdometryOptions as OdometryOptions
 from gavo_jax.settings import Settings as Settings

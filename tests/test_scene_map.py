@@ -9,24 +9,17 @@ import numpy as np
 import pytest
 from small import CAMERA
 
-from gavo_jax import scene_map
+from gavo_jax import map_fusion
 from gavo_jax.alignment.result import no_alignment, with_finding
 from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.rendered.sensor_noise import NONE
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.libusb import import_open3d
+from gavo_jax.map_fusion import LiveMap, MapBuilder, build_map
 from gavo_jax.odometry.driver import Step
 from gavo_jax.odometry.run import OdometryRun
-from gavo_jax.scene_map import (
-    LARGEST,
-    LiveMap,
-    MapBuilder,
-    SceneMap,
-    build_map,
-    check_map,
-    check_voxel,
-)
+from gavo_jax.scene_map import LARGEST, SceneMap, check_map, check_voxel
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory
 
@@ -133,7 +126,7 @@ def stepped(index: int, *findings: AlignmentStatus, segment: int = 0, **values: 
 
 def test_a_map_is_made_of_frames_that_can_be_trusted(monkeypatch):
     """Of frozen or foreign depth, and of guessed poses, the map was made, too."""
-    monkeypatch.setattr("gavo_jax.scene_map.MapBuilder", Fused)
+    monkeypatch.setattr("gavo_jax.map_fusion.MapBuilder", Fused)
     doubts = (AlignmentStatus.FROZEN, AlignmentStatus.DEPTH_MISMATCH, AlignmentStatus.NO_DEPTH)
     steps = [stepped(1), *(stepped(2 + i, doubt) for i, doubt in enumerate(doubts)), stepped(5, origin="guessed")]
     steps += [stepped(6, lost=True, origin="guessed"), stepped(7, AlignmentStatus.PARTIAL_DEPTH)]
@@ -144,7 +137,7 @@ def test_a_map_is_made_of_frames_that_can_be_trusted(monkeypatch):
 
 def test_a_map_goes_through_segments_that_loops_have_joined(monkeypatch):
     """They were left out by the steps' segments, although the trajectory said that they lie in one world."""
-    monkeypatch.setattr("gavo_jax.scene_map.MapBuilder", Fused)
+    monkeypatch.setattr("gavo_jax.map_fusion.MapBuilder", Fused)
     steps = [stepped(i, segment=int(i > 4)) for i in range(1, 8)]
     poses = np.stack([np.eye(4)] * 8)
     poses[:, 0, 3] = 10 * np.arange(8)
@@ -155,7 +148,7 @@ def test_a_map_goes_through_segments_that_loops_have_joined(monkeypatch):
 
 def test_a_stamp_that_comes_again_has_a_pose_of_its_own(monkeypatch):
     """A clock that was set back: both frames of a stamp were put where the second one was."""
-    monkeypatch.setattr("gavo_jax.scene_map.MapBuilder", Fused)
+    monkeypatch.setattr("gavo_jax.map_fusion.MapBuilder", Fused)
     stamps = [*WALK.timestamps[:4], *WALK.timestamps[1:4]]
     steps = [stepped(1), stepped(2), stepped(3), *(stepped(i, segment=1) for i in (1, 2, 3))]
     poses = np.stack([np.eye(4)] * 7)
@@ -165,7 +158,7 @@ def test_a_stamp_that_comes_again_has_a_pose_of_its_own(monkeypatch):
 
 
 def test_frames_before_the_first_reference_are_no_part_of_a_map(monkeypatch):
-    monkeypatch.setattr("gavo_jax.scene_map.MapBuilder", Fused)
+    monkeypatch.setattr("gavo_jax.map_fusion.MapBuilder", Fused)
     steps = [stepped(1, AlignmentStatus.NO_REFERENCE, segment=1, lost=True)]
     steps += [stepped(i, segment=1) for i in (2, 3)]
     frames, _, left_out = fused(steps)
@@ -174,7 +167,7 @@ def test_frames_before_the_first_reference_are_no_part_of_a_map(monkeypatch):
 
 def test_what_moves_on_its_own_is_no_part_of_a_map(monkeypatch):
     fuser = Fused()
-    monkeypatch.setattr("gavo_jax.scene_map.MapBuilder", lambda *_: fuser)
+    monkeypatch.setattr("gavo_jax.map_fusion.MapBuilder", lambda *_: fuser)
     mask = np.zeros((CAMERA.height, CAMERA.width), bool)
     mask[:, : CAMERA.width // 2] = True
     build_map(WALK, [stepped(1), stepped(2)], moving=lambda step: mask if step.index == 2 else None)
@@ -335,7 +328,7 @@ def test_a_wall_that_lies_on_the_voxels_is_seen() -> None:
 def test_a_full_map_keeps_what_is_near(monkeypatch) -> None:
     """The first frame that went beyond was left out as a whole."""
     far = np.linalg.norm(wall(2.01, 0.02).points, axis=1).max()
-    monkeypatch.setattr(scene_map, "MOST_BLOCKS", 300)
+    monkeypatch.setattr(map_fusion, "MOST_BLOCKS", 300)
     seen = wall(2.01, 0.02)
     assert 2.0 < np.linalg.norm(seen.points, axis=1).max() < far - 0.1
     assert "more than 300 blocks" in seen.left_out[0]

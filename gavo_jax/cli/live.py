@@ -22,6 +22,7 @@ from gavo_jax.datasets.live.frames import LiveDevice, LiveImages, Newest, frame_
 from gavo_jax.early import INTERRUPTED, LOST
 from gavo_jax.errors import GavoError, print_message
 from gavo_jax.interrupts import interruptible
+from gavo_jax.map_fusion import LiveMap, MapBuilder
 from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.metrics import run_identity
 from gavo_jax.odometry.run import finish_run
@@ -29,7 +30,7 @@ from gavo_jax.output.files import RECORDING, TRAJECTORY, circumstances
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import say, waiting
 from gavo_jax.output.trajectories import formats, remove_trajectories, write_trajectories
-from gavo_jax.scene_map import LiveMap, MapBuilder, Shape
+from gavo_jax.scene_map import Shape
 from gavo_jax.settings import Settings
 from gavo_jax.settings_check import as_seed
 from gavo_jax.trajectory import Trajectory

@@ -7,10 +7,11 @@ from gavo_jax.cli.options import Run
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.errors import GavoError
 from gavo_jax.libusb import import_open3d
+from gavo_jax.map_fusion import build_map
 from gavo_jax.odometry.hindsight import revised
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import frame_progress, say
-from gavo_jax.scene_map import SceneMap, Shape, build_map, check_map, check_voxel, warn_of
+from gavo_jax.scene_map import SceneMap, Shape, check_map, check_voxel, warn_of
 from gavo_jax.trajectory import Trajectory
 
 

@@ -63,7 +63,7 @@ class OdometryRun:
             GavoError: Open3D cannot be imported, the shape is unknown, the voxel is absurd, or the run does not hold
                 its sequence.
         """
-        from gavo_jax.scene_map import build_map
+        from gavo_jax.map_fusion import build_map
 
         if self.sequence is None:
             raise GavoError("the run does not contain the sequence that it was run over, so no map can be made")

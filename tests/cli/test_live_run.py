@@ -17,8 +17,8 @@ from gavo_jax.datasets.live.frames import LiveImages
 from gavo_jax.datasets.rendered.sensor_noise import NONE
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
+from gavo_jax.map_fusion import build_map
 from gavo_jax.odometry.run import run_odometry
-from gavo_jax.scene_map import build_map
 from gavo_jax.trajectory import Trajectory
 
 WIDE = replace(CAMERA, width=320)
