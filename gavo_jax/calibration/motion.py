@@ -3,7 +3,7 @@
 import numpy as np
 
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
-from gavo_jax.datasets.rectified import rectified_at
+from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoError
 
 WINDOW = 45
@@ -45,10 +45,10 @@ def _changes(sequence: Sequence, count: int) -> np.ndarray:
     """Difference of each image from the one before, relative to its contrast; 0 where one cannot be read."""
     if count <= WINDOW:
         return np.zeros(max(count - 1, 0))
-    changes, before = np.zeros(count - 1), None
+    changes, before, camera = np.zeros(count - 1), None, sequence.camera.rectified()
     for index in range(count):
         try:
-            grey = np.asarray(rectified_at(sequence, index).grey)[::8, ::8].astype(np.float32)
+            grey = np.asarray(rectified(sequence[index], camera).grey)[::8, ::8].astype(np.float32)
         except FrameError:
             before = None
             continue
@@ -61,9 +61,10 @@ def _changes(sequence: Sequence, count: int) -> np.ndarray:
 def _readable(sequence: Sequence, start: int, length: int) -> list[Frame]:
     """Return the longest run of readable frames with increasing stamps."""
     runs: list[list[Frame]] = [[]]
+    camera = sequence.camera.rectified()
     for index in range(start, start + length):
         try:
-            frame = rectified_at(sequence, index)
+            frame = rectified(sequence[index], camera)
         except FrameError:
             runs.append([])
             continue
