@@ -103,7 +103,7 @@ def correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float((a * b).sum()) / size if size > 1e-3 else 0.0
 
 
-@dataclass
+@dataclass(eq=False)
 class Keyframe:
     """A frame of the map.
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from gavo_jax.alignment.judgement import is_unknown
 from gavo_jax.bodies.records import without_moving
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
@@ -33,7 +34,7 @@ GROWTH = 1.25
 FIRST = 20
 """Number of keyframes at the first optimisation."""
 SOUGHT_OF_SEGMENT = 5
-"""Number of keyframes of a segment tied to no other one that are searched for among those of the others."""
+"""Number of keyframes at either end of a segment that are searched for among those of segments it is not tied to."""
 MOST_IN_THE_END = 100
 """Number of candidates, the most similar ones, that are aligned when loops are searched for again at the end."""
 REMEMBERED = 64
@@ -134,7 +135,8 @@ class Mapper:
 
     def find(self, frame: Frame, segment: int) -> Found | None:
         """Return where a frame was taken that nothing ties to earlier frames; see `driver.Relocaliser`."""
-        self._place = place = self._find(frame, [k for k in self.keyframes.searchable() if k.segment != segment])
+        earlier = [k for k in self.keyframes.searchable() if k.segment < segment]  # not what came of this one
+        self._place = place = self._find(frame, earlier) if earlier else None
         if place is None or place.edge.alignment is None:
             return None
         world_T_camera = place.keyframe.world_T_odometry @ place.edge.earlier_T_later
@@ -183,30 +185,48 @@ class Mapper:
             frame, step, twist = self._newest
             self._add(self._made(frame, step, twist, self._known.get(stamp_name(step.timestamp))))
             self._newest = None
+        steps = list(steps)
         self._doubt(steps)
+        self._distrust({step.index for step in steps if not step.depth_is_trusted})
         if not self.keyframes.all:
             return Loops([], [], Solution(np.zeros((0, 4, 4)), np.zeros(0), np.zeros((0, 6)), 1.0))
         self._optimise(reweighted=1)
-        self._join()
+        if self._join():
+            self._optimise(reweighted=1)
         candidates = [candidate for keyframe in self.keyframes.searchable() for candidate in self._candidates(keyframe)]
         candidates.sort(key=lambda candidate: -candidate.likeness)
         self._close(candidates[:MOST_IN_THE_END])
         return Loops(self.keyframes.all, self.edges, self._optimise(REWEIGHTED))
 
-    def _join(self) -> None:
-        """Try to tie segments without an edge to earlier ones, by their first keyframes."""
-        kept = self.keyframes.searchable()
-        for segment in sorted({keyframe.segment for keyframe in kept}):
+    def _join(self) -> bool:
+        """Tie segments, or those tied to each other, to earlier ones, until no more can be; whether any was tied."""
+        kept, asked, joined = self.keyframes.searchable(), {}, 0
+        while True:
             first = tied_segments(self.keyframes.all, self.edges)
-            if first[segment] < segment:
-                continue
-            own = [keyframe for keyframe in kept if keyframe.segment == segment]
-            others = [keyframe for keyframe in kept if first[keyframe.segment] < segment]
-            for keyframe in own[:SOUGHT_OF_SEGMENT] if others else ():
+            for root in sorted(set(first.values())):
+                own = [keyframe for keyframe in kept if first[keyframe.segment] == root]
+                others = [keyframe for keyframe in kept if first[keyframe.segment] < root]
+                if asked.get(root) != (len(own), len(others)) and self._tie_to(own, others):
+                    joined += 1
+                    break
+                asked[root] = len(own), len(others)
+            else:
+                return joined > 0
+
+    def _tie_to(self, own: list[Keyframe], others: list[Keyframe]) -> bool:
+        """Tie some keyframes to others by the first or last of each of their segments; whether one was found."""
+        if not others:
+            return False
+        for segment in dict.fromkeys(keyframe.segment for keyframe in own):
+            ones = [keyframe for keyframe in own if keyframe.segment == segment]
+            ends = (*ones[:SOUGHT_OF_SEGMENT], *ones[SOUGHT_OF_SEGMENT:][: -SOUGHT_OF_SEGMENT - 1 : -1])
+            for keyframe in ends:
                 place = self.recogniser.find(keyframe, others)
                 if place is not None:
-                    self._link(keyframe, place.edge)
-                    break
+                    later = max(keyframe, place.keyframe, key=lambda one: one.number)
+                    self._link(later, in_order(place.edge))
+                    return True
+        return False
 
     def _made(
         self, frame: Frame, step: Step, twist: Float64[np.ndarray, " 6"], uncertainty: "_Uncertainty | None"
@@ -229,11 +249,21 @@ class Mapper:
                 earlier = None if before in stamps else tracked.get(before)
                 step = earlier if earlier and earlier.index < step.index else None  # stamps may repeat
 
+    def _distrust(self, frames: set[int]) -> None:
+        """Drop loops and images of keyframes whose depth turned out to be wrong, by their frames' indices."""
+        wrong = {keyframe.number for keyframe in self.keyframes.all if keyframe.index in frames}
+        self.edges = [edge for edge in self.edges if wrong.isdisjoint((edge.earlier, edge.later))]
+        for keyframe in self.keyframes.searchable():
+            if keyframe.number in wrong:
+                keyframe.give_up_images()
+
     def _follow(self, step: Step) -> None:
         """Accumulate the covariance of the motion since the last keyframe."""
-        before = self._known.get(stamp_name(step.reference_timestamp))
+        reference = stamp_name(step.reference_timestamp)
+        before = self._known.get(reference)
         covariance = _covariance(step)
         if before is not None and np.isfinite(covariance).all():
+            self._known.move_to_end(reference)  # many frames may have the same one
             motion = np.asarray(step.alignment.target_T_reference, np.float64)
             covariance = transport_covariance(motion, before.covariance + covariance)
             self._known[stamp_name(step.timestamp)] = _Uncertainty(covariance, before.in_doubt or is_in_doubt(step))
@@ -310,10 +340,10 @@ def _own_velocity(step: Step) -> Float64[np.ndarray, " 6"]:
     """Motion of the points in the camera at a step's moment, m/s and rad/s.
 
     This is the mean since its reference, corrected by the sway that the rolling shutter reveals; 0 where the timestamps
-    tell no time.
+    tell no time, or the motion took another time or is unknown.
     """
-    seconds = step.timestamp - step.reference_timestamp
-    if seconds <= 0:
+    seconds, result = step.timestamp - step.reference_timestamp, step.alignment
+    if seconds <= 0 or AlignmentStatus.IMPLAUSIBLE_MOTION in result.statuses or is_unknown(result):
         return np.zeros(6)
     motion, sway = (np.asarray(of, np.float64) for of in (step.alignment.target_T_reference, step.alignment.sway))
     return (log(motion) + sway) / max(seconds, 1e-3)
@@ -325,6 +355,18 @@ def mirrored(covariance: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6
     A computed covariance is symmetric but for its last digits, and a resumed run has to make the same map.
     """
     return np.triu(covariance) + np.triu(covariance, 1).T
+
+
+def in_order(edge: Edge) -> Edge:
+    """The edge from its earlier keyframe to its later one."""
+    if edge.earlier < edge.later:
+        return edge
+    return edge._replace(
+        earlier=edge.later,
+        later=edge.earlier,
+        earlier_T_later=inverse(edge.earlier_T_later),
+        covariance=transport_covariance(edge.earlier_T_later, edge.covariance),
+    )
 
 
 def tied_segments(keyframes: list[Keyframe], edges: Iterable[Edge]) -> dict[int, int]:

@@ -47,6 +47,8 @@ def followed(before: Beginning | None, stamp: float, share: float, *, is_referen
     """
     if before is None:
         return None
+    if stamp < before.since:  # the clock was set back
+        before = before._replace(since=stamp, moving_since=None if before.moving_since is None else stamp)
     if revised_by(before, share):
         before = Beginning(before.since)
     moving_since = stamp if before.moving_since is None and share > 0 else before.moving_since

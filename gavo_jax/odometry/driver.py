@@ -139,6 +139,8 @@ class FrameOutcome(NamedTuple):
     bodies: tuple[Body, ...] = ()
     revises: int = 0
     """See `Step.revises`."""
+    is_guess: bool = False
+    """Whether the motion is a guess, though the pair is not lost."""
 
 
 class Odometry:
@@ -234,8 +236,8 @@ class Odometry:
         else:
             outcome = self._align(before, usable, finding)
         after, result, lost, bodies = outcome.after, outcome.result, outcome.lost, outcome.bodies
-        origin = "guessed" if lost or after.unknown else "tracked"
-        found = self._seek(after, usable if finding.use is Use.ALL else None)
+        origin = "guessed" if lost or outcome.is_guess else "tracked"
+        found = self._seek(after, usable if finding.use is Use.ALL else None, before.held)
         if found is not None:
             after = after._replace(
                 world_T_reference=found.world_T_camera,
@@ -246,8 +248,7 @@ class Odometry:
                 beginning=None,
             )
             new_T_old = found.world_T_camera @ inverse(outcome.after.world_T_camera)
-            # a lost search takes for bodies what does not fit its wrong motion
-            bodies = () if lost else tuple(body.moved(new_T_old) for body in bodies)
+            bodies = tuple(body.moved(new_T_old) for body in bodies)
             result, lost, origin = with_finding(found.alignment, finding.status), False, "relocalised"
         elif after.adrift:
             after = after._replace(adrift=after.adrift + 1)
@@ -309,7 +310,8 @@ class Odometry:
         after = after._replace(leap=leap if after.held else None, arrival=kept if after.held else renewed)
         size = (self.camera.height, self.camera.width)
         since = before.world_T_reference if attempt.is_found else None
-        bodies = tuple(in_world(seen, after.world_T_camera, since, size) for seen in attempt.bodies)
+        seen_bodies = () if lost else attempt.bodies  # a lost search takes for one what does not fit its wrong motion
+        bodies = tuple(in_world(seen, after.world_T_camera, since, size) for seen in seen_bodies)
         revises = attempt.revises
         if not lost:
             shown, is_reference = sum(seen.share for seen in attempt.bodies), after.tracker is not before.tracker
@@ -321,19 +323,25 @@ class Odometry:
             after = after._replace(depth=watch)
             if watch.found_wrong and not before.depth.found_wrong:
                 revises = max(revises, watch.pairs_covered(before.last_index))
-        return FrameOutcome(after, result, lost, attempt.candidates, bodies, revises)
+        return FrameOutcome(after, result, lost, attempt.candidates, bodies, revises, attempt.unknown > 0)
 
-    def _seek(self, after: Progress, frame: Frame | None) -> Found | None:
-        """Look for a frame in the map if it has become the reference of a segment that is adrift."""
+    def _seek(self, after: Progress, frame: Frame | None, held: int) -> Found | None:
+        """Look for a frame in the map if it has become the reference of a segment that is adrift.
+
+        After the first frames that is one in every `SOUGHT_EVERY`, or the next reference; the last one is `held` back.
+        """
         if self.relocaliser is None or frame is None or not after.adrift or after.held:
             return None
-        if after.adrift > SOUGHT_AT_ONCE and after.adrift % SOUGHT_EVERY:
+        is_due = after.adrift // SOUGHT_EVERY > (after.adrift - held - 1) // SOUGHT_EVERY
+        if after.adrift > SOUGHT_AT_ONCE and not is_due:
             return None
         return self.relocaliser.find(frame, after.segment)
 
     def _restart(self, before: Progress, frame: Frame) -> Progress:
         """Make a frame the only reference, at the recorded pose; unless it is the first, this starts a new segment."""
         here = before if before.last_index == 0 else before.in_new_segment()
+        if before.tracker is None:  # there is nothing to tie it to
+            here = here._replace(adrift=0)
         return here._replace(
             tracker=self.aligner.start(frame),
             reference_timestamp=frame.timestamp,
@@ -364,9 +372,7 @@ class Odometry:
         result = with_finding(result, finding.status)
         world_T_camera = before.world_T_reference @ inverse(np.asarray(result.target_T_reference))
         after = before._replace(world_T_camera=world_T_camera, held=before.held + 1, doubted=doubted)
-        if attempt.unknown:
-            after = after._replace(unknown=before.unknown + attempt.unknown)
-        elif before.unknown:
+        if before.unknown and not attempt.unknown:
             after = after._replace(unknown=0)
             if before.unknown >= MAX_HELD:  # too many guesses to go on in the same world
                 after = after.in_new_segment()
@@ -379,6 +385,7 @@ class Odometry:
                 world_T_reference=world_T_camera,
                 held=0,
                 way=Way(),
+                unknown=before.unknown + attempt.unknown if attempt.unknown else 0,
             )
         elif not attempt.unknown and UNFIT_FOR_WAY.isdisjoint(result.statuses):
             since = frame.timestamp - before.reference_timestamp

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from small import CAMERA
 
+from gavo_jax.alignment.judgement import UNDETERMINED
 from gavo_jax.alignment.result import no_alignment, with_finding
 from gavo_jax.bodies.records import Body, Seen
 from gavo_jax.camera import Camera
@@ -19,14 +20,16 @@ from gavo_jax.mapping.background import mapper_of
 from gavo_jax.mapping.candidates import APART, MAX_CANDIDATES, MIN_SECONDS, LoopCandidate, find_candidates
 from gavo_jax.mapping.correction import correct, loop_figures
 from gavo_jax.mapping.keyframes import NOTHING_SEEN, Keyframe, Keyframes, shift, shifts
-from gavo_jax.mapping.mapper import Mapper, tied_segments
+from gavo_jax.mapping.mapper import Mapper, _own_velocity, _Uncertainty, in_order, tied_segments
+from gavo_jax.mapping.relocalisation import Place
 from gavo_jax.mapping.verification import Edge
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Found, Odometry, Step
 from gavo_jax.odometry.metrics import compute_metrics
+from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.run import doubts_of, trajectory_of
 from gavo_jax.output.frames import FRAME_COLUMNS, frame_row
-from gavo_jax.rigid_motions import exp, length_and_angle, log
+from gavo_jax.rigid_motions import exp, length_and_angle, log, transport_covariance
 from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import Trajectory, inverse
@@ -48,6 +51,97 @@ def test_keyframes_of_images_of_any_size_can_be_compared(width: int, height: int
     one, other = (keyframes.make(frame, index, 0, np.eye(4), np.zeros(6)) for index in range(2))
     share, correlation = one.thumbnail.agreement(other.thumbnail, np.eye(4), keyframes.camera)
     assert share > 0.6 and correlation > 0.99
+
+
+@pytest.mark.parametrize(
+    ("sees", "tied"),
+    [
+        ([{0, 2}, {1, 2}], []),  # the second is seen from the third alone
+        ([{0, 2}], [Edge(3, 6, np.eye(4), np.eye(6))]),  # and was tied to it before
+        ([{0, 1}, {0, 2}], []),
+    ],
+)
+def test_segments_are_joined_until_no_more_can_be(sees: list[set[int]], tied: list[Edge]) -> None:
+    """Each was looked for once, and not by what had been tied to it: it stayed apart."""
+    mapper: Any = Mapper(CAMERA)
+    numbers = enumerate([0, 0, 0, 1, 1, 1, 2, 2, 2])
+    images: Any = object()
+    mapper.keyframes.all = [
+        Keyframe(i, i, float(i), s, np.eye(4), np.eye(4), None, images, NOTHING_SEEN) for i, s in numbers
+    ]
+    mapper.edges = list(tied)
+
+    def find(frame: Keyframe, others: list[Keyframe]) -> Place | None:
+        seen = [other for other in others if {frame.segment, other.segment} in sees]
+        motion = exp(np.array([0.1, 0, 0, 0, 0.2, 0]))
+        return Place(seen[-1], Edge(seen[-1].number, frame.number, motion, np.eye(6))) if seen else None
+
+    mapper.recogniser = SimpleNamespace(find=find)
+    assert mapper._join() and not mapper._join()
+    assert tied_segments(mapper.keyframes.all, mapper.edges) == {0: 0, 1: 0, 2: 0}
+    assert all(edge.earlier < edge.later for edge in mapper.edges)
+
+
+def test_the_ends_of_an_edge_are_exchanged_with_its_motion_and_covariance() -> None:
+    motion, half = exp(np.array([0.3, -0.2, 0.5, 0.1, 0.4, -0.2])), np.random.default_rng(0).normal(size=(6, 6))
+    edge = in_order(Edge(5, 2, motion, half @ half.T))
+    assert (edge.earlier, edge.later) == (2, 5)
+    np.testing.assert_allclose(edge.earlier_T_later @ motion, np.eye(4), atol=1e-12)
+    step = 1e-6 * np.array([1.0, 2.0, -1.0, 0.5, -2.0, 1.0])
+    here = log(inverse(edge.earlier_T_later) @ inverse(motion @ exp(step)))
+    np.testing.assert_allclose(
+        np.outer(here, here), transport_covariance(motion, np.outer(step, step)), rtol=1e-3, atol=1e-17
+    )
+    same = in_order(Edge(5, 2, motion, np.outer(step, step))).covariance
+    np.testing.assert_allclose(np.outer(here, here), same, rtol=1e-3, atol=1e-17)
+
+
+def test_only_earlier_segments_are_searched_for_a_frame() -> None:
+    """A segment found in another one was then found again in what had come of it, back and forth every ten frames."""
+    mapper: Any = Mapper(CAMERA)
+    images, asked = SimpleNamespace(), []
+    mapper.keyframes.all = [
+        Keyframe(i, i, float(i), i, np.eye(4), np.eye(4), None, images, NOTHING_SEEN)  # pyright: ignore
+        for i in range(4)
+    ]
+    mapper._find = lambda frame, keyframes: asked.append([keyframe.segment for keyframe in keyframes])
+    for segment in (2, 1, 0):
+        assert mapper.find(WALK[0], segment) is None
+    assert asked == [[0, 1], [0]], "nothing to search, nothing made of the frame"
+
+
+def test_a_motion_that_took_another_time_is_not_the_frame_s_own() -> None:
+    """Of a leap over missing frames the keyframe was freed of ten times its velocity."""
+    motion = exp(np.array([0.1, 0, 0, 0, 0.05, 0]))
+    for status, is_known in ((AlignmentStatus.OK, True), (AlignmentStatus.IMPLAUSIBLE_MOTION, False)):
+        result = with_finding(no_alignment(AlignmentStatus.OK), status)
+        result = result._replace(target_T_reference=motion, covariance=1e-6 * np.eye(6))
+        step = Step(1, 0.0, 0.1, result, np.eye(4), 1.0, False)
+        assert _own_velocity(step).any() == is_known
+    unknown = result._replace(status=AlignmentStatus.OK, findings=0, covariance=UNDETERMINED**2 * np.eye(6))
+    assert not _own_velocity(replace(step, alignment=unknown)).any()
+
+
+def test_depth_that_turns_out_to_be_wrong_closes_no_loop() -> None:
+    """Loops to frames that a later one found to have wrong depth stayed in the map."""
+    mapper: Any = Mapper(CAMERA)
+    for index in range(3):
+        mapper.keyframes.all.append(mapper.keyframes.make(WALK[index], index, 0, np.eye(4), np.zeros(6)))
+        mapper.keyframes.all[-1].number = index
+    mapper.edges = [Edge(0, 1, np.eye(4), np.eye(6)), Edge(0, 2, np.eye(4), np.eye(6))]
+    mapper._distrust({1, 7})
+    assert [(edge.earlier, edge.later) for edge in mapper.edges] == [(0, 2)]
+    assert [keyframe.number for keyframe in mapper.keyframes.searchable()] == [0, 2]
+
+
+def test_a_reference_that_is_held_for_long_is_still_known() -> None:
+    """After 64 frames with one reference, the motion to the next keyframe counted as unknown."""
+    mapper: Any = Mapper(CAMERA)
+    mapper._known["0.000000"] = _Uncertainty(np.zeros((6, 6)), False)
+    result = no_alignment(AlignmentStatus.OK)._replace(covariance=1e-6 * np.eye(6))
+    for index in range(1, 100):
+        mapper._follow(Step(index, 0.0, index / 30, result, np.eye(4), 1.0, False))
+    assert "0.000000" in mapper._known
 
 
 def test_segments_are_tied_over_others():
@@ -376,6 +470,42 @@ def test_a_frame_that_is_found_shows_no_body_of_a_search_that_failed(found_at: i
         step = driver.register(frame, frame.timestamp)
     assert step is not None and step.origin == "relocalised"
     assert len(step.bodies) == (0 if found_at == 8 else 1), "the next one's is seen by a motion that holds"
+
+
+def test_a_lost_pair_shows_no_body():
+    """To a wrong motion a third of a static room was a body, in bodies.csv and in the masks."""
+    aligner = Sure((Seen(1, np.ones((3, 4), np.float32), 0.9, np.zeros(3)),))
+    driver, steps = Odometry(CAMERA, Settings(), aligner=aligner), []
+    for i in range(10):
+        frame = replace(WALK[i], timestamp=i / RATE)
+        if 4 <= i < 8:
+            frame = replace(frame, grey=np.zeros_like(frame.grey), depth=np.zeros_like(frame.depth))
+        steps.append(driver.register(frame, frame.timestamp))
+    assert [len(step.bodies) for step in steps[1:]] == [0 if step.lost else 1 for step in steps[1:]]
+    assert steps[8].lost and not steps[9].lost
+
+
+def test_a_run_whose_first_frames_are_dark_is_not_adrift():
+    """Every tenth frame of the whole run was looked for in a map that held nothing else."""
+    driver = Odometry(CAMERA, Settings(), aligner=Sure(), relocaliser=(relocaliser := Knows(None)))
+    for i in range(6):
+        frame = replace(WALK[i], timestamp=i / RATE)
+        if i < 2:
+            frame = replace(frame, grey=np.zeros_like(frame.grey))
+        driver.register(frame, frame.timestamp)
+    assert driver.progress.adrift == 0 and relocaliser.asked == 0
+
+
+@pytest.mark.parametrize("parity", [0, 1])
+def test_a_segment_adrift_is_looked_for_whichever_frames_become_references(parity: int):
+    """With depth in every other frame, a tenth frame was never a reference, and the search was over after ten."""
+    driver = Odometry(CAMERA, Settings(), aligner=Sure(), relocaliser=(relocaliser := Knows(None)))
+    counts = []
+    for adrift in range(11, 61):
+        held = (adrift + parity) % 2
+        driver._seek(Progress(adrift=adrift, held=held), WALK[0], held=1 - held)
+        counts.append(relocaliser.asked)
+    assert counts[-1] == 5
 
 
 def test_what_is_found_again_after_a_gap_says_so():

@@ -29,6 +29,13 @@ def track(before: Beginning | None, frames: int, stamp: float = 0.0, share: floa
     return reduce(lambda track, stamp: followed(track, stamp, share, is_reference=True), stamps, before)
 
 
+def test_a_clock_that_was_set_back_begins_the_second_anew() -> None:
+    """The track stayed unproven for as long as the clock was set back, and then all of it counted as a body's."""
+    before = track(begun(None, 3600.0), 3, 3600.0)
+    assert before is not None and track(before, 10, 0.0) is not None
+    assert track(before, round(PROVEN_AFTER * RATE) + 3, 0.0) is None
+
+
 def test_what_moves_behind_a_break_was_followed_before_it() -> None:
     followed_before = track(begun(None, 0.0), 10)
     assert revised_by(followed_before, 0.5) == 0  # a body that comes in is no news of the past

@@ -335,6 +335,24 @@ def test_behind_a_stretch_of_guesses_a_new_segment_starts(unknown: tuple[int, ..
     assert metrics["guessed_pairs"] == sum(n > 0 for n in unknown) and metrics["lost_pairs"] == 0
 
 
+class GuessingAside(Guessing):
+    """The same, whose guesses become no reference: a near body takes the depth with it."""
+
+    def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+        attempt = super().align(state, frame, clock)
+        return attempt._replace(fit=not attempt.unknown)
+
+
+def test_guesses_that_lead_nowhere_do_not_break_the_trajectory() -> None:
+    """The next frame was aligned with the reference before them, and began a segment though its motion was known."""
+    unknown = (0, 1, 1, 1, 1, 0, 0)
+    sequence = Rendered(frames=len(unknown) + 1, camera=CAMERA, noise=NONE)
+    odometry = Odometry(CAMERA, aligner=GuessingAside(*unknown))
+    steps = [odometry.register(frame, index / 30) for index, frame in enumerate(sequence)][1:]
+    assert [step.segment for step in steps if step is not None] == [0] * len(unknown)
+    assert [step.origin for step in steps if step is not None] == ["guessed" if n else "tracked" for n in unknown]
+
+
 @pytest.mark.parametrize("use", [AlignmentStatus.NO_DEPTH, AlignmentStatus.FROZEN, AlignmentStatus.PARTIAL_DEPTH])
 def test_a_frame_without_depth_is_no_reference_however_long_the_old_one_is_held(use: AlignmentStatus) -> None:
     """Where a high error was confirmed for three frames, one whose depth was missing became it."""
