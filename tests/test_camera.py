@@ -11,7 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gavo_jax.camera import PRESETS, RIM, Camera, preset_for_sequence, require_camera, vignetting_gain
+from gavo_jax.camera import (
+    PRESETS,
+    RIM,
+    Camera,
+    in_image,
+    inverse_depth,
+    preset_for_sequence,
+    require_camera,
+    vignetting_gain,
+)
 from gavo_jax.camera_files.calibration import load_camera
 from gavo_jax.errors import GavoError
 
@@ -108,6 +117,25 @@ def test_a_camera_of_jax_numbers_undistorts_like_one_of_pythons():
     np.testing.assert_array_equal(traced.undistort_image(image), camera.undistort_image(image))
     depth = image.astype(np.uint16)
     np.testing.assert_array_equal(traced.undistort_depth(depth), camera.undistort_depth(depth))
+
+
+@pytest.mark.parametrize("k2", [-0.05, -0.2])
+def test_a_fisheye_reaches_to_where_its_polynomial_turns_back(k2):
+    """Catches powers of the angle that are those of another model: θ + k2 θ⁵ turns back at θ⁴ = -1 / (5 k2)."""
+    fisheye = replace(SMALL, distortion=(0.0, k2, 0.0, 0.0), model="fisheye")
+    assert fisheye.reach == pytest.approx(np.tan((-5 * k2) ** -0.25), rel=5e-3)
+
+
+def test_an_image_ends_at_the_centres_of_its_outermost_pixels():
+    """Catches one column or row too many, which would be read from beyond the image."""
+    u, v = [0.0, 63.0, 63.01, -0.01, 5.0, 5.0], [47.0, 0.0, 5.0, 5.0, 47.01, -0.01]
+    assert in_image(SMALL, np.array(u), np.array(v)).tolist() == [True, True, False, False, False, False]
+
+
+def test_inverse_depth_is_per_metre_and_0_without_a_reading():
+    """Catches raw depth that is multiplied by its scale, and readings that are none."""
+    readings = np.array([5000.0, 10000.0, 0.0, np.nan, np.inf, -5000.0])
+    np.testing.assert_array_equal(inverse_depth(readings, SMALL), [1.0, 0.5, 0.0, 0.0, 0.0, 0.0])
 
 
 def test_a_lens_reaches_to_where_its_polynomial_turns_back():
@@ -330,6 +358,7 @@ def test_no_camera_file_raises_anything_else(tmp_path_factory, content, suffix):
         ({"vignetting": (1e300,)}, "vignetting: multiplies parts"),
         ({"depth_scale": 0.0}, "depth_scale: expected a positive number"),
         ({"readout": -0.02}, "readout: expected seconds"),
+        ({"readout": None}, "readout: expected seconds from 0 to 1, got None"),
         ({"readout": 20.0}, "readout: expected seconds from 0 to 1, got 20.0"),
         ({"distortion": [0.1, 0.0, 0.0, 0.0]}, "distortion: expected a tuple of 4, 5, 8, 12, 14 numbers"),
         ({"distortion": (0.1, 0.2, 0.3)}, "distortion: expected a tuple"),
@@ -385,3 +414,4 @@ def test_images_have_whole_numbers_of_pixels(wrong: Any) -> None:
         with pytest.raises(GavoError, match="expected a whole number of at least 1"):
             call()
     assert camera.binned(np.int64(2)) == camera.resized(80, 60)  # pyright: ignore[reportArgumentType]
+    assert camera.resized(80, 30) == Camera(65.5, 32.75, 39.5, 14.5, 80, 30), "each side by its own factor"

@@ -259,6 +259,15 @@ def test_results_say_what_they_are():
     assert summary["max"] == error.translation.max >= error.translation.rmse >= error.translation.mean > 0
 
 
+def test_definitions_name_the_span_and_how_near_the_truth_has_to_be():
+    """Catches a figure over seven frames that says it is over one, or one whose limit is TUM's but says otherwise."""
+    truth = smooth_truth(rate=120.0)
+    for delta, span in ((1, "over 1 frame,"), (7, "over 7 frames,")):
+        assert span in relative_pose_error(truth, truth, delta, "frames").translation.definition
+    dense, sparse = (relative_pose_error(truth, truth[::step]).rotation.definition for step in (1, 12))
+    assert "over 1 s" in dense and "within" not in dense and sparse.endswith("nearest true stamps within 0.02 s")
+
+
 @pytest.mark.parametrize("which", ["estimate", "truth"])
 def test_poses_that_are_not_known_are_left_out(which):
     """They ended in a traceback or in a drift that is not-a-number; unknown stamps alone in no drift at all."""
@@ -319,6 +328,10 @@ def test_too_little_to_compare_is_refused():
     for estimate in (elsewhere, empty):
         with pytest.raises(GavoError):
             distance_error(estimate, truth)
+    with pytest.raises(GavoError, match=r"no associated poses 7 frames apart \(7 associate\)"):
+        relative_pose_error(short, truth, 7, "frames")
+    with pytest.raises(GavoError, match=r"only 0 poses of estimate and ground truth are within 0\.02 s of each other"):
+        relative_pose_error(elsewhere, truth, 1, "frames")
 
 
 @pytest.mark.parametrize(

@@ -160,6 +160,17 @@ def test_a_gap_is_told_a_single_missing_frame_is_not(frames, seen):
         assert look(seen, later)[0] == [Finding(status, Use.ALL)]
 
 
+def test_a_gap_is_told_whatever_gaps_there_were_before(frames, seen):
+    """Catches an interval that counts as usual because it came once."""
+    interval, stamp, statuses = frames[1].timestamp - frames[0].timestamp, frames[4].timestamp, []
+    history = seen
+    for frame, intervals in zip(frames[:4], (10, 1, 1, 9), strict=True):
+        stamp += intervals * interval
+        finding, history = check_frame(replace(frame, timestamp=stamp), stamp, CAMERA, history)
+        statuses.append(finding.status)
+    assert statuses == [Status.GAP, Status.OK, Status.OK, Status.GAP]
+
+
 CHANGES = {
     "a clock that was set back": (lambda frame: replace(frame, timestamp=frame.timestamp - 50.0), Status.BAD_TIMESTAMP),
     "depth three times nearer": (lambda frame: replace(frame, depth=frame.depth // 3), Status.DEPTH_UNITS),

@@ -81,6 +81,8 @@ def test_values_of_every_kind():
         ("solver.population", [16, 16], ["population", "list of 5 whole numbers"]),
         ("solver.population", [0, 16, 20, 24, 2], ["population", "level 4"]),
         ("solver.population.5", 16, ["population.5", "no such entry"]),
+        ("solver.population.-1", 16, ["population.-1", "no such entry"]),
+        ("solver.population.x", 16, ["population.x", "no such entry"]),
         ("solver.population", 3, ["population", "at least 4"]),
         ("solver.iterations", 16, ["iterations", "list of 5 whole numbers"]),
         ("solver.iterations", [0, 0, 0, 0, 0], ["iterations"]),
@@ -213,6 +215,11 @@ def test_a_name_without_its_part_is_told_with_it():
 
 
 def test_somebody_elses_code_is_not_written(tmp_path):
+    class Own(GeneticAlgorithm):
+        """Its name would not be known to who reads it."""
+
+    with pytest.raises(GavoError, match="cannot store a Own: not a solver of this package"):
+        save_settings(tmp_path / "settings.toml", Settings(Own()))
     own = replace(presets.preset(), alignment=replace(presets.preset().alignment, loss=lambda s: s))
     with pytest.raises(GavoError, match="loss"):
         save_settings(tmp_path / "settings.toml", own)

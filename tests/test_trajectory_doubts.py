@@ -54,6 +54,13 @@ def test_a_trajectory_of_another_size_is_told(data_dir, clip, factor):
     assert relative_size(estimate, scaled(truth, factor)) == pytest.approx(1 / factor, rel=0.05)
 
 
+@pytest.mark.parametrize(("factor", "is_told"), [(0.8, True), (0.9, False), (1.0, False), (1.1, False), (1.25, True)])
+def test_a_size_that_a_depth_sensor_may_be_off_by_is_not_another_one(factor, is_told):
+    """Catches a word about the unit of depth where the scale is off by a tenth, as that of many a sensor."""
+    truth = smooth_truth()
+    assert (relative_size(scaled(truth, factor), truth) is not None) == is_told
+
+
 @pytest.mark.parametrize("clip", CLIPS)
 def test_a_trajectory_that_drifts_or_is_of_another_camera_has_no_other_size(data_dir, clip):
     noisy, truth = real_pair(data_dir / clip)
@@ -84,5 +91,5 @@ def test_a_size_needs_motion_and_enough_poses_of_one_segment():
     apart = replace(half, world_T_camera=poses, segments=(np.arange(len(truth)) >= 200).astype(int))
     assert relative_size(apart, truth) == pytest.approx(0.5)
     lost = half.world_T_camera.copy()
-    lost[5] = np.nan
+    lost[5, 0, 3] = np.nan
     assert relative_size(replace(half, world_T_camera=lost), truth) == pytest.approx(0.5)

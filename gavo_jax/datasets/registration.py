@@ -97,10 +97,15 @@ class Registration:
 
     @cached_property
     def _footprints(self) -> tuple[np.ndarray, np.ndarray]:
-        """Size in columns and rows of the colour image of each depth pixel on a surface seen head-on."""
+        """Size in columns and rows of the colour image of each depth pixel on a surface seen head-on.
+
+        It is that of the box around the pixel, which may be turned: one camera may be mounted on its side.
+        """
         x, y = (axis.reshape(self.depth.height, self.depth.width) for axis in self._rays[:2])
-        columns = FOOTPRINT * np.abs(self.color.fx * np.gradient(x, axis=1))
-        rows = FOOTPRINT * np.abs(self.color.fy * np.gradient(y, axis=0))
+        columns, rows = (
+            FOOTPRINT * focal * sum(np.abs(change) for change in np.gradient(axis))
+            for focal, axis in ((self.color.fx, x), (self.color.fy, y))
+        )
         return tuple(np.minimum(size, MARGIN).ravel().astype(np.float32) for size in (columns, rows))
 
     @cached_property

@@ -3,7 +3,7 @@
 import numpy as np
 from carded import BOX, OTHER, THIN, field
 
-from gavo_jax.bodies.identity import BodyTracks, associate, body_components
+from gavo_jax.bodies.identity import MAX_UNSEEN, BodyTracks, associate, body_components
 
 
 def test_what_is_thin_is_no_body() -> None:
@@ -48,3 +48,54 @@ def test_bodies_keep_their_numbers() -> None:
     assert alone.labels[20, 20] == number
     again = associate(both, alone)
     assert set(again.numbers[again.numbers > 0]) == {1, 2} and again.labels[20, 20] == number
+
+
+def at(*places: tuple[slice, slice]) -> np.ndarray:
+    """Parts of a mask, numbered from 1."""
+    found = np.zeros((60, 80), np.int32)
+    for number, place in enumerate(places, start=1):
+        found[place] = number
+    return found
+
+
+NOWHERE = at()
+
+
+def test_a_hidden_body_keeps_its_number_for_a_while() -> None:
+    """Catches one that is never forgotten, or at once, and a number that is given where there is nothing."""
+    tracks = associate(at(BOX), BodyTracks.empty((60, 80)))
+    for unseen in range(1, MAX_UNSEEN + 1):
+        tracks = associate(NOWHERE, tracks)
+        assert tracks.numbers.tolist() == [1] + [0] * 7 and tracks.ages[0] == unseen and tracks.last == 1
+        assert (tracks.labels == at(BOX)).all(), "expected where it was last seen"
+        assert associate(at(BOX), tracks).labels[BOX].min() == 1
+    forgotten = associate(NOWHERE, tracks)
+    assert not forgotten.numbers.any() and not forgotten.labels.any()
+    assert associate(at(BOX), forgotten).numbers[0] == 2, "no number is given twice"
+
+
+def test_a_hidden_body_is_not_what_comes_near_its_place() -> None:
+    """Only what was there in the last frame can have gone so far since."""
+    near = np.s_[20:40, 24:34]
+    seen = associate(at(np.s_[20:40, 10:20]), BodyTracks.empty((60, 80)))
+    assert associate(at(near), seen).labels[near].min() == 1
+    assert associate(at(near), associate(NOWHERE, seen)).labels[near].min() == 2
+
+
+def test_of_a_body_that_falls_apart_the_part_that_overlaps_more_keeps_the_number() -> None:
+    """Whichever comes first among the parts; and of two bodies that meet, the larger overlap decides."""
+    small, large = np.s_[10:20, 10:20], np.s_[10:40, 30:50]
+    whole = associate(at(np.s_[10:40, 10:50]), BodyTracks.empty((60, 80)))
+    for parts in ((small, large), (large, small)):
+        labels = associate(at(*parts), whole).labels
+        assert (labels[large].min(), labels[small].min()) == (1, 2)
+    for parts in ((small, large), (large, small)):
+        two = associate(at(*parts), BodyTracks.empty((60, 80)))
+        met = associate(at(np.s_[10:40, 10:50]), two)
+        assert (met.labels == two.labels[large].min()).sum() == 30 * 40
+
+
+def test_how_far_a_body_can_have_gone_is_by_the_smaller_of_its_two_sizes() -> None:
+    """Catches a speck that takes the number of a large body far away."""
+    large, speck = np.s_[5:55, 5:45], np.s_[28:32, 70:74]
+    assert associate(at(speck), associate(at(large), BodyTracks.empty((60, 80)))).labels[speck].min() == 2

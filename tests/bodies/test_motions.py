@@ -49,6 +49,31 @@ def test_a_motion_in_the_camera_is_one_in_the_world() -> None:
     assert float(rows[0][BODY_COLUMNS.index("dy")]) == 0.05 and np.isnan(float(rows[1][BODY_COLUMNS.index("dx")]))
 
 
+def test_bodies_that_a_frame_shows_are_where_their_readings_are() -> None:
+    """Catches a place in another unit, and a body that is told of a frame that does not show it."""
+    shown, hidden = np.s_[20:40, 10:20], np.s_[5:15, 60:70]
+    found, inverse_depth = np.zeros((60, 80), np.int32), np.zeros((60, 80))
+    found[shown], found[hidden] = 1, 2
+    tracks = associate(found, BodyTracks.empty((60, 80)))
+    found[hidden] = 0
+    inverse_depth[20:40, 10:16] = 0.25  # the others have no reading
+    parts: dict[str, Any] = {
+        "segmenter": SimpleNamespace(camera=CAMERA),
+        "state": SimpleNamespace(scene=SimpleNamespace(tracks=tracks)),
+        "belief": SimpleNamespace(moving=np.where(found > 0, 0.0, 0.5)),
+        "frame": None,
+        "clock": None,
+    }
+    after, (body,) = motions.find_motions(None, found=found, inverse_depth=inverse_depth, **parts)
+    assert (body.number, body.share, body.alignment) == (1, pytest.approx(20 * 10 / 4800), None)
+    np.testing.assert_array_equal(body.field > 0, found > 0)
+    x, y = (12.5 - CAMERA.cx) / CAMERA.fx, (29.5 - CAMERA.cy) / CAMERA.fy
+    np.testing.assert_allclose(body.centroid, [4 * x, 4 * y, 4.0])
+    assert after.ages[:2].tolist() == [0, 1] and after.labels[hidden].min() == 2
+    _, (unread,) = motions.find_motions(None, found=found, inverse_depth=0 * inverse_depth, **parts)
+    assert np.isnan(unread.centroid).all() and unread.centroid.shape == (3,)
+
+
 def test_a_bodys_motion_is_its_own_under_a_rolling_shutter() -> None:
     """Rows see a body go its own way: moved to the frame's moment along the camera's, it was off by 8 mm and 1.3°."""
     sequence = SyntheticSequence(14, camera=replace(CAMERA, readout=0.03), bodies=1)

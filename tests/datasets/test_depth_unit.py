@@ -11,7 +11,14 @@ from written_folders import CAMERA, LAYOUTS, METRES, image, kinect, raw
 from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import Calibration
 from gavo_jax.datasets.depth_doubts import doubt_of_depth
-from gavo_jax.datasets.depth_unit import better_scale, doubt_of_guess, doubt_of_scale, sample_depth
+from gavo_jax.datasets.depth_unit import (
+    better_scale,
+    doubt_of_guess,
+    doubt_of_scale,
+    is_unusual,
+    lack_of_depth,
+    sample_depth,
+)
 from gavo_jax.datasets.files import Entry, FileSequence, Reading
 from gavo_jax.datasets.images import read_depth
 from gavo_jax.datasets.registry import open_source
@@ -114,7 +121,53 @@ def test_a_depth_that_is_unusually_near_is_set_beside_another_unit(tmp_path, sca
         image(tmp_path / f"rgb/{i}.png", np.full((120, 160), 99, np.uint8))
         image(tmp_path / f"depth/{i}.png", raw(0.5 * metres, 1000))
     doubt = doubt_of_scale(open_source(tmp_path, Reading(CAMERA, depth_scale=scale)))
-    assert doubt is None if words is None else doubt and re.search(words, doubt)
+    assert doubt is None if words is None else doubt and re.search(words, doubt) and "fractions" not in doubt
+
+
+def test_of_two_units_the_one_that_gives_an_ordinary_room_is_proposed():
+    """Catches the one that brings everything nearest: fifths of a millimetre would be 0.6 m, millimetres are 3 m."""
+    assert proposed(smooth(depths(2.5, 3.5), 1000.0), 1e6, OWN, False) == 1000
+    assert proposed(smooth(depths(0.9, 1.1), 5000.0), 1e7, OWN, False) == 5000
+
+
+@pytest.mark.parametrize(
+    ("median", "farthest", "scale", "unusual"),
+    [
+        (1.0, 3.0, 1000.0, False),
+        (0.2, 0.5, 1000.0, False),  # a wrist's camera: in no other unit is it usual
+        (0.2, 0.5, 5000.0, True),  # 1 m in millimetres
+        (0.1, 0.5, 1000.0, True),
+        (200.0, 900.0, 1000.0, True),
+        (30.0, 90.0, 1.0, False),  # a street
+        (0.3, 1.0, 1.0, True),  # shares of a greatest distance
+        (0.3, 1.1, 1.0, False),
+    ],
+)
+def test_depth_is_unusual_where_another_unit_would_make_it_usual(median, farthest, scale, unusual):
+    assert is_unusual(median, farthest, scale) == unusual
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+def test_depth_that_misses_the_colour_image_is_told_from_none_at_all(recorded):
+    """Catches the wrong advice: an inverted transform between the cameras leaves nothing, though all was read."""
+    sequence = SyntheticSequence(frames=3, camera=CAMERA)
+
+    class Missed:
+        camera, calibration = CAMERA, None
+
+        def __len__(self):
+            return 3
+
+        def __getitem__(self, index):
+            return replace(sequence[index], depth=np.zeros_like(sequence[index].depth))
+
+        def raw_depth(self, index):
+            return sequence[index].depth * recorded
+
+    lack = lack_of_depth(Missed())  # pyright: ignore[reportArgumentType]
+    words = "no depth reading of the 3 frames sampled falls into the colour image" if recorded else "no depth readings"
+    assert lack and lack.startswith(words)
+    assert lack_of_depth(sequence) is None
 
 
 def tum_folder(folder: Path, metres: np.ndarray, scale: float, sensor=smooth, stated: str = "") -> Path:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gavo_jax.datasets.clocks import told_stamp
 from gavo_jax.datasets.names import Found, by_number, images_among, mask_numbers
 from gavo_jax.datasets.names import stamps as read
 from gavo_jax.errors import GavoError
@@ -104,6 +105,19 @@ def test_a_frame_that_is_missing_changes_no_unit():
     assert found is not None and found[-1] - found[0] == pytest.approx(0.4)
 
 
+def test_a_long_gap_changes_no_unit():
+    """Catches milliseconds that are taken for frame numbers where recording paused for half a second."""
+    found = stamps(["1000", "1033", "1066", "1100", "1133", "1166", "1700", "1733", "1766", "1800", "1834"])
+    assert found is not None and found[-1] - found[0] == pytest.approx(0.834)
+
+
+@pytest.mark.parametrize("stamp", [True, "1.0", None, np.nan, 1e20, [1.0]])
+def test_what_is_no_stamp_in_a_json_file_is_refused(stamp):
+    with pytest.raises(GavoError, match=r"^f\.json: timestamp: expected seconds, found .*: pass --rate"):
+        told_stamp("f.json", stamp)
+    assert told_stamp("f.json", 3) == 3 and told_stamp("f.json", -0.5) == -0.5
+
+
 @pytest.mark.parametrize(
     "names",
     [
@@ -125,6 +139,7 @@ def test_a_frame_that_is_missing_changes_no_unit():
         ["12-30-59.900", "12-30-59.933", "12-31-00.000"],
         [f"00_00_{i // 100:02}_{10 * (i % 100):03}" for i in range(150)],
         ["23_59_59_900", "23_59_59_934", "23_59_59_967", "00_00_00_000"],
+        [f"23_59_59_{ms}" for ms in range(701, 1000, 33)] + [f"00_00_00_{ms:03}" for ms in range(31, 300, 33)],
         ["20249901123059", "20249901123060"],
         [],
         ["a", "b"],

@@ -35,6 +35,14 @@ def test_median_and_quartiles():
     assert unknown.drift is None and unknown.rotation is None and unknown.per_frame == pytest.approx(0.0015)
 
 
+def test_figures_per_frame_are_of_the_runs_that_have_one():
+    """Catches a traceback where the truth covers one of two runs only, and the least of the runs tracked together."""
+    table = rows("a", "ga", [0.01, 0.02, 0.03])
+    table[2]["rpe_translation_rmse_m_per_frame"], table[1]["runs_together"] = None, 1
+    (found,) = summarise(table)
+    assert found.per_frame == pytest.approx(0.0015) and found.together == 4
+
+
 def test_runs_that_ended_early_are_told():
     """Their figures, of the frames before the first lost pair, stood beside those of whole runs without a word."""
     planned = json.dumps({"sequence": {"frames": 90}})
@@ -82,3 +90,18 @@ def test_pairs_are_matched_by_seed_and_over_sequences():
     assert list(found) == ["b", ALL]  # a single pair, as on a, is no comparison
     assert (found["b"].pairs, found["b"].ratio) == (2, 3.0)  # the one run of y stands against both seeds
     assert found[ALL].pairs == 3
+
+
+def test_a_pair_of_runs_that_both_got_lost_says_nothing() -> None:
+    """Catches a ratio of infinities, which is not a number; and a single tie that takes the test away."""
+    (found,) = compare(rows("a", "x", [0.1, None, 0.3, 0.2]) + rows("a", "y", [0.1, None, 0.6, 0.4]))
+    assert found.pairs == 3 and found.ratio == 0.5 and found.p is not None
+
+
+def test_sequences_of_earlier_versions_are_not_compared_over_all() -> None:
+    """Catches a line over all sequences that repeats the only one of the present version."""
+    table = rows("a", "x", [0.1, 0.2]) + rows("a", "y", [0.2, 0.4]) + rows("old", "x", [9.0]) + rows("old", "y", [1.0])
+    assert [found.sequence for found in compare(table, earlier=["old"])] == ["a"]
+    table += rows("b", "x", [0.1, 0.2]) + rows("b", "y", [0.2, 0.4])
+    found = {comparison.sequence: comparison for comparison in compare(table, earlier=["old"])}
+    assert list(found) == ["a", "b", ALL] and found[ALL].pairs == 4

@@ -19,7 +19,7 @@ from gavo_jax.image.motion_compensation import compensate_motion
 from gavo_jax.mapping.background import mapper_of
 from gavo_jax.mapping.candidates import APART, MAX_CANDIDATES, MIN_SECONDS, LoopCandidate, find_candidates
 from gavo_jax.mapping.correction import correct, loop_figures
-from gavo_jax.mapping.keyframes import NOTHING_SEEN, Keyframe, Keyframes, shift, shifts
+from gavo_jax.mapping.keyframes import NOTHING_SEEN, SPACING, Keyframe, Keyframes, correlation, shift, shifts
 from gavo_jax.mapping.mapper import Mapper, _own_velocity, _Uncertainty, in_order, tied_segments
 from gavo_jax.mapping.relocalisation import Place
 from gavo_jax.mapping.verification import Edge
@@ -244,6 +244,41 @@ def test_shifts_of_many_are_those_of_any_two():
     poses = np.stack([exp(0.4 * xi) for xi in np.random.default_rng(0).normal(size=(8, 6))])
     wanted = [[shift(inverse(a) @ b, 2.0) for b in poses] for a in poses]
     np.testing.assert_allclose(shifts(poses, 2.0), wanted, atol=1e-7)
+
+
+def test_thumbnails_agree_where_they_show_the_same():
+    """Of the walk's first frame and others, by their true poses: the share that is seen, and how alike it is."""
+    truth, keyframes = WALK.ground_truth.world_T_camera, Keyframes(CAMERA)
+    first, near, far = (
+        keyframes.make(WALK[i], i, 0, inverse(truth[0]) @ truth[i], np.zeros(6)).thumbnail for i in (0, 4, 12)
+    )
+    seen, alike = first.agreement(first, np.eye(4), keyframes.camera)
+    assert seen > 0.97 and alike > 0.999
+    shares = []
+    for other, i in ((near, 4), (far, 12)):
+        seen, alike = first.agreement(other, inverse(truth[i]) @ truth[0], keyframes.camera)
+        wrong = first.agreement(other, inverse(truth[0]) @ truth[i], keyframes.camera)[1]
+        assert alike > 0.9 and alike > wrong
+        shares.append(seen)
+    assert 1.0 > shares[0] > shares[1] > 0.3
+    away = exp(np.array([0.0, 0.0, 0.0, 0.0, 3.0, 0.0]))
+    assert first.agreement(first, away, keyframes.camera) == (0.0, 0.0), "behind the camera"
+    a, b = np.array([1.0, 2.0, 4.0]), np.array([2.0, 1.0, -3.0])
+    assert correlation(a, b) == pytest.approx(np.corrcoef(a, b)[0, 1])
+    assert correlation(np.ones(3), np.arange(3.0)) == 0.0
+
+
+def test_a_keyframe_is_due_after_some_motion_and_in_each_segment():
+    keyframes = Keyframes(CAMERA)
+    assert keyframes.is_due(np.eye(4), 0)
+    keyframes.add(keyframes.make(WALK[0], 0, 0, exp(np.array([1.0, 0, 0, 0, 0.5, 0])), np.zeros(6)))
+    last = keyframes.all[0]
+    for share, due in ((0.9, False), (1.1, True)):
+        aside = np.array([share * SPACING * last.thumbnail.distance, 0, 0, 0, 0, 0])
+        assert keyframes.is_due(last.world_T_odometry @ exp(aside), 0) is due
+        turned = np.array([0, 0, 0, 0, share * SPACING, 0])
+        assert keyframes.is_due(last.world_T_odometry @ exp(turned), 0) is due
+    assert keyframes.is_due(last.world_T_odometry, 1)
 
 
 def drifting(sequence: SyntheticSequence, drift: np.ndarray) -> list[Step]:

@@ -17,9 +17,10 @@ from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA
 from gavo_jax.evaluation import rotation_angle
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import Odometry, Step
-from gavo_jax.odometry.leaps import Leap, align_leaping
+from gavo_jax.odometry.leaps import Leap, _seconds, align_leaping
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.presets import preset
+from gavo_jax.rigid_motions import exp
 from gavo_jax.status import AlignmentStatus as Status
 from gavo_jax.trajectory import inverse
 
@@ -130,6 +131,78 @@ def test_a_motion_that_is_only_guessed_confirms_no_leap() -> None:
 def test_leap_after_leap() -> None:
     steps = follow([0, 1, 2, 12, 13, 30, 31, 45, 46])
     assert places(steps) == [1, 2, 2, 13, 13, 31, 31, 46]
+
+
+VELOCITY = np.array([4.0, -1.0, 0.5, 0.2, -0.5, 0.3])
+"""Of the points in the camera, m/s and rad/s."""
+
+
+class Searching(StandIn):
+    """Expects a velocity, and finds one motion whatever the time; it counts what it was asked."""
+
+    def __init__(self, found: Attempt, velocity: NDArray[np.float64] = VELOCITY) -> None:
+        self.found, self.velocity, self.asked = found, velocity, []
+
+    def predict(self, state: object, elapsed: float) -> NDArray[np.float64]:
+        return exp(self.velocity * elapsed)
+
+    def align(self, state: object, frame: Frame, clock: Clock) -> Attempt:
+        self.asked.append(float(clock.elapsed))
+        return self.found if len(self.asked) == 1 else self.found._replace(usable=True)
+
+
+def found(motion: NDArray[np.float64], status: Status = Status.OK, usable: bool = True) -> Attempt:
+    return Attempt(None, no_alignment(status)._replace(target_T_reference=motion), usable)
+
+
+FRAME = Frame(np.zeros((2, 2), np.uint8), np.full((2, 2), 5000, np.uint16), 2 * DT)
+CLOCK = Clock(np.float32(2 * DT), np.float32(0), np.uint32(1))
+FAR = exp(np.array([0.4, 0.0, 0.3, 0.0, 1.5, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("leap", "motion", "is_confirmed"),
+    [
+        (FAR, exp(VELOCITY * DT) @ FAR, True),
+        (FAR, exp(np.array([0.5, 0, 0, 0, 0, 0])) @ exp(VELOCITY * DT) @ FAR, False),  # by its translation alone
+        (FAR, exp(np.array([0, 0, 0, 0, 0, 0.5])) @ exp(VELOCITY * DT) @ FAR, False),  # by its rotation alone
+        (FAR, exp(VELOCITY * 2 * DT), False),  # where it was expected
+        (exp(np.array([0.05, 0, 0, 0, 0, 0])) @ exp(VELOCITY * DT), exp(VELOCITY * 2 * DT), False),  # nearer to that
+    ],
+)
+def test_a_leap_is_confirmed_by_one_ordinary_step_further(
+    leap: NDArray[np.float64], motion: NDArray[np.float64], is_confirmed: bool
+) -> None:
+    """Of a camera that turns as well: catches steps that are taken off on the wrong side."""
+    aligner = Searching(found(motion))
+    attempt, later = align_leaping(aligner, None, FRAME, CLOCK, Leap(leap, 10 * DT, DT))
+    assert aligner.asked == pytest.approx([2 * DT, 11 * DT]), "as long as the leap and the step together"
+    assert later is None and attempt.usable
+    assert attempt.result.statuses == (Status.IMPLAUSIBLE_MOTION if is_confirmed else Status.OK,)
+
+
+@pytest.mark.parametrize("before", [None, Leap(FAR, 10 * DT, DT)])
+@pytest.mark.parametrize("status", [Status.LOW_OVERLAP, Status.HIGH_ERROR])
+def test_what_failed_for_another_reason_is_no_leap(before: Leap | None, status: Status) -> None:
+    """Nothing is searched again, and nothing is remembered."""
+    aligner = Searching(found(FAR, status, usable=False))
+    attempt, later = align_leaping(aligner, None, FRAME, CLOCK, before)
+    assert later is None and not attempt.usable and len(aligner.asked) == 1
+    usable = Searching(found(FAR, Status.IMPLAUSIBLE_MOTION))  # as a wider search may find it
+    assert align_leaping(usable, None, FRAME, CLOCK, None)[1] is None and len(usable.asked) == 1
+
+
+@pytest.mark.parametrize(
+    ("turn", "speed", "frames"),
+    [(0.1, 0.6, 5.0), (0.4, 0.6, 20.0), (1.0, 0.6, 30.0), (0.001, 0.6, 1.0), (0.05, 0.0, 10.0), (3.0, 0.0, 30.0)],
+)
+def test_a_leap_lasts_as_long_as_the_camera_needs_for_it(turn: float, speed: float, frames: float) -> None:
+    """At its last speed; a second at most, the time between the stamps at least, and no eternity from rest."""
+    axis = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+    clock = CLOCK._replace(elapsed=np.float32(DT))
+    assert _seconds(Searching(found(FAR), speed * axis), None, clock, found(exp(turn * axis))) == pytest.approx(
+        frames * DT, rel=1e-5
+    )
 
 
 def real(

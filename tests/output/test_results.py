@@ -16,8 +16,10 @@ from gavo_jax.odometry.progress import Progress
 from gavo_jax.output.files import describe, json_text, prepare_folder, write_json
 from gavo_jax.output.frames import FRAME_COLUMNS, frame_row, read_run
 from gavo_jax.output.run_folder import RunFolder
+from gavo_jax.rigid_motions import exp
 from gavo_jax.settings import OdometryOptions
 from gavo_jax.status import AlignmentStatus
+from gavo_jax.trajectory import inverse
 
 
 @dataclass(frozen=True)
@@ -205,6 +207,35 @@ def test_a_finished_run_is_whole(tmp_path: Path, name: str) -> None:
         GavoError, match="2 pairs in trajectory.txt and frames.csv, and 3 in metrics.json: files are cut off"
     ):
         read_run(folder)
+
+
+def test_the_steps_of_a_run_come_back_as_they_were(tmp_path: Path) -> None:
+    """Of a camera that turns: catches motions between the wrong poses or the wrong way round, and a lost origin."""
+    poses = [exp(np.array([0.3, -0.1, 0.2, 0.1, -0.4, 0.3]) * i) @ exp(np.eye(6)[i % 6]) for i in range(5)]
+    references, origins = (0, 1, 0, 3), ("tracked", "guessed", "relocalised", "tracked")
+    steps = []
+    for i, (reference, origin) in enumerate(zip(references, origins, strict=True), start=1):
+        result = no_alignment(AlignmentStatus.OK if i < 4 else AlignmentStatus.LOW_TEXTURE)._replace(
+            target_T_reference=inverse(poses[i]) @ poses[reference],
+            covariance=np.diag((1e-3 * np.arange(1, 7)) ** 2),
+            error=np.float32(0.1 * i),
+            overlap=np.float32(0.9),
+        )
+        world, lost = inverse(poses[0]) @ poses[i], i == 2
+        steps.append(Step(i, reference / 30, i / 30, result, world, 2.5 * i, lost, segment=i // 3, origin=origin))
+    with RunFolder(tmp_path / "run") as folder:
+        folder.start({}, 0.0)
+        for one in steps:
+            folder.add(one)
+    (tmp_path / "run" / "config.json").write_text("{}")
+    for read, wrote in zip(read_run(tmp_path / "run").steps, steps, strict=True):
+        names = ("index", "timestamp", "reference_timestamp", "milliseconds", "lost", "segment", "origin", "revises")
+        assert [getattr(read, name) for name in names] == [getattr(wrote, name) for name in names]
+        assert read.alignment.statuses == wrote.alignment.statuses
+        assert (read.alignment.error, read.alignment.overlap) == (wrote.alignment.error, wrote.alignment.overlap)
+        np.testing.assert_allclose(read.world_T_camera, wrote.world_T_camera, atol=1e-9)
+        np.testing.assert_allclose(read.alignment.target_T_reference, wrote.alignment.target_T_reference, atol=1e-9)
+        np.testing.assert_allclose(read.alignment.covariance, wrote.alignment.covariance, rtol=1e-9)
 
 
 def test_a_run_with_loops_that_was_killed_is_read(tmp_path):
