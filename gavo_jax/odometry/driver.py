@@ -320,7 +320,7 @@ class Odometry:
             result, watch = judge_by_depth(before.depth, frame, bodies, float(clock.elapsed), result, self.camera)
             after = after._replace(depth=watch)
             if watch.found_wrong and not before.depth.found_wrong:
-                revises = max(revises, watch.pairs_covered(before.last_index))
+                result, revises = watch.blamed(result, revises, before.last_index)
         return FrameOutcome(after, result, lost, attempt.candidates, bodies, revises)
 
     def _seek(self, after: Progress, frame: Frame | None) -> Found | None:
