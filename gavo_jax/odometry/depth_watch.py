@@ -29,6 +29,22 @@ class DepthWatch(NamedTuple):
         by_change = self.change.pairs_covered(pairs) if self.change.is_unexplained else 0
         return max(by_change, self.edges.pairs_covered(pairs) if self.edges.fault else 0)
 
+    def blamed(self, result: Alignment, revises: int, pairs: int) -> tuple[Alignment, int]:
+        """Blame the depth for the pairs before the one at which it is found wrong; see `Step.revises`.
+
+        Args:
+            result: Result of that pair. Its status is what the earlier ones get.
+            revises: Number of pairs before it that are wrong for another reason.
+            pairs: Number of pairs before it.
+
+        Returns:
+            The result and the number of wrong pairs; as they were if fewer of them are the depth's fault.
+        """
+        covered = self.pairs_covered(pairs)
+        if covered < max(revises, 1):
+            return result, revises
+        return result._replace(status=AlignmentStatus.DEPTH_MISMATCH), covered
+
 
 def watch_from(before: DepthWatch | None, frame: Frame, camera: Camera) -> DepthWatch:
     """Continue with another reference, or start with a run's first one."""

@@ -5,7 +5,7 @@ It checks each frame, has an aligner find its motion, decides what becomes of th
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
 import jax
@@ -21,13 +21,14 @@ from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Frame, FrameError, as_seconds, require_begin_in_seconds, require_grey_levels
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoWarning
-from gavo_jax.frame_checks import Finding, Use, check_frame, doubts_last_stamp
+from gavo_jax.frame_checks import Finding, Use, doubt_unit_of_time, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt
 from gavo_jax.odometry.beginnings import begun, followed, revised_by
 from gavo_jax.odometry.composition import make_aligner, warm_up_wholly
 from gavo_jax.odometry.depth_watch import judge_by_depth, watch_from
 from gavo_jax.odometry.leaps import align_leaping
 from gavo_jax.odometry.misplaced import arrival_of, doubt_reference
+from gavo_jax.odometry.overlays import Sight
 from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.second_thoughts import without_depth
 from gavo_jax.odometry.way import Way
@@ -219,13 +220,10 @@ class Odometry:
         timestamp = as_seconds("timestamp", timestamp)
         frame = self._accepted(frame, timestamp)
         stopwatch = Stopwatch()
-        overlays, self.frame = self.progress.overlays, None
-        if isinstance(frame, Frame):
-            overlays = overlays.after(frame.grey, self.progress.world_T_camera)
-            self.frame = overlays.without(frame)
-            frame = replace(self.frame, depth=frame.depth)  # no fault of the sensor's
-        finding, history = check_frame(frame, timestamp, self.camera, self.progress.history)
-        before = self.progress._replace(last_index=self.progress.last_index + 1, history=history, overlays=overlays)
+        sight, here = Sight(self.progress.history, self.progress.overlays), self.progress.world_T_camera
+        sight, self.frame, finding = sight.after(frame, timestamp, self.camera, here)
+        before = self.progress._replace(last_index=self.progress.last_index + 1, **sight._asdict())
+        doubt_unit_of_time(before.last_index, before.history)
         usable = self.frame if finding.use is not Use.NOTHING else None
         if usable is not None and finding.use is Use.GREY:
             usable = without_depth(usable)
@@ -310,8 +308,10 @@ class Odometry:
         after = after._replace(leap=leap if after.held else None, arrival=kept if after.held else renewed)
         size = (self.camera.height, self.camera.width)
         since = before.world_T_reference if attempt.is_found else None
-        seen_bodies = () if lost else attempt.bodies  # a lost search takes for one what does not fit its wrong motion
-        bodies = tuple(in_world(seen, after.world_T_camera, since, size) for seen in seen_bodies)
+        trusted = () if lost else attempt.bodies  # a lost search takes for one what does not fit its wrong motion
+        numbered = map(before.numbering.given_to, trusted)
+        bodies = tuple(in_world(seen, after.world_T_camera, since, size) for seen in numbered)
+        after = after._replace(numbering=before.numbering.after(bodies, lost and after.tracker is not before.tracker))
         revises = attempt.revises
         if not lost:
             shown, is_reference = sum(seen.share for seen in attempt.bodies), after.tracker is not before.tracker
@@ -322,7 +322,7 @@ class Odometry:
             result, watch = judge_by_depth(before.depth, frame, bodies, float(clock.elapsed), result, self.camera)
             after = after._replace(depth=watch)
             if watch.found_wrong and not before.depth.found_wrong:
-                revises = max(revises, watch.pairs_covered(before.last_index))
+                result, revises = watch.blamed(result, revises, before.last_index)
         return FrameOutcome(after, result, lost, attempt.candidates, bodies, revises, attempt.unknown > 0)
 
     def _seek(self, after: Progress, frame: Frame | None, held: int) -> Found | None:

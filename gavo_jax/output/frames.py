@@ -81,6 +81,15 @@ def read_steps(folder: Path, trajectory: Trajectory | None = None) -> list[Step]
     return steps
 
 
+def recorded_stamps(path: Path) -> set[str]:
+    """Return the timestamps in a frames.csv, as they stand there.
+
+    Raises:
+        GavoError: It cannot be read.
+    """
+    return {row.get("timestamp", "") for row in _rows_of(path)}
+
+
 def _rows_of(path: Path) -> list[dict[str, str]]:
     try:
         return list(csv.DictReader(read_text(path).splitlines()))

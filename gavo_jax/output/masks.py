@@ -3,6 +3,7 @@
 Each pixel holds the number of the body that covers it, 0 for the background.
 """
 
+from collections.abc import Set
 from pathlib import Path
 
 import cv2
@@ -72,8 +73,12 @@ def read_labels(folder: Path, timestamp: float) -> Integer[np.ndarray, "height w
     return labels
 
 
-def remove_masks(folder: Path, after: float = -np.inf) -> None:
-    """Remove the images of frames after a timestamp, and the folder if it is empty then.
+def remove_masks(folder: Path, kept: Set[str] = frozenset()) -> None:
+    """Remove a run's images of other frames than some, and the folder if it is empty then.
+
+    Args:
+        folder: Folder of the run.
+        kept: Timestamps of those frames, as `stamp_name` writes them.
 
     Raises:
         GavoError: One cannot be removed.
@@ -83,7 +88,8 @@ def remove_masks(folder: Path, after: float = -np.inf) -> None:
         return
     try:
         for path in (*inside.glob("*.png"), *inside.glob(f"*.png.*{PARTIAL}")):  # also partial files of a killed run
-            if _stamp(path) > float(stamp_name(after)):  # rounded as in the names
+            stamp = _stamp(path)
+            if not (np.isnan(stamp) or stamp_name(stamp) in kept):
                 path.unlink()
         if not any(inside.iterdir()):
             inside.rmdir()

@@ -43,7 +43,7 @@ from gavo_jax.output.files import (
     remove_files,
     write_json,
 )
-from gavo_jax.output.frames import FRAME_COLUMNS, as_line, frame_row, read_steps, with_hindsight
+from gavo_jax.output.frames import FRAME_COLUMNS, as_line, frame_row, read_steps, recorded_stamps, with_hindsight
 from gavo_jax.output.masks import MASKS, read_masks, remove_masks, write_masks
 from gavo_jax.output.motions import MOTION_COLUMNS, motion_row, with_motions
 from gavo_jax.output.seen_images import SeenImages
@@ -232,7 +232,7 @@ class RunFolder:
             remove_figures(self.path)
         self._whole, self._segment = (files, images, progress), progress.segment
         self._last_pose = _last_stamp(self.path / self._poses)
-        remove_masks(self.path, after=self._last_pose)
+        remove_masks(self.path, kept=recorded_stamps(self.path / FRAMES))
         return progress
 
     def _growing(self, config: Mapping[str, Any]) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """Tracks a sequence with progress display, interruptible by Ctrl-C."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 from gavo_jax.compilation.waits import Stopwatch, told_of_waits
@@ -19,7 +20,7 @@ class Tracked(NamedTuple):
     """Result of tracking a sequence, possibly only up to an interruption."""
 
     steps: list[Step]
-    """Steps in the order of the frames."""
+    """Steps in the order of the frames, without bodies: their masks would fill the memory."""
     interrupted: bool
     seconds: float
     """Wall time of the tracking, decoding included, compilation excluded."""
@@ -64,7 +65,7 @@ def track_visibly(
                     with postponed():  # or the count of steps and what is written of them would differ
                         if on_step is not None:
                             on_step(step)
-                        steps.append(step)
+                        steps.append(replace(step, bodies=()))
                     bar.advance()
         except KeyboardInterrupt:
             if not steps:

@@ -102,6 +102,26 @@ def test_depth_that_was_never_right_is_told_of_every_pair(
     assert all(flagged(revised(steps))) and all(flagged(revised(revised(steps))))
 
 
+@pytest.mark.parametrize("status", [AlignmentStatus.MOVING_BODY, AlignmentStatus.IMPLAUSIBLE_MOTION])
+def test_wrong_depth_is_told_of_every_pair_whatever_else_the_pair_shows_at_which_it_is_found(
+    status: AlignmentStatus,
+) -> None:
+    """The pairs before it got the status that this one had already: they were said to have followed a body."""
+
+    class Doubting(Knowing):
+        def align(self, state: Any, frame: Frame, clock: Clock) -> Attempt:
+            attempt = super().align(state, frame, clock)
+            is_last = frame.timestamp == room()[0][MIN_REMEMBERED].timestamp
+            return attempt._replace(result=with_finding(attempt.result, status)) if is_last else attempt
+
+    odometry = Odometry(CAMERA, aligner=Doubting())
+    upside_down = [replace(frame, depth=np.flipud(frame.depth)) for frame in room()[0][: MIN_REMEMBERED + 1]]
+    steps = [step for frame in upside_down if (step := odometry.register(frame, frame.timestamp)) is not None]
+    assert flagged(steps) == [False] * (MIN_REMEMBERED - 1) + [True] and status in steps[-1].alignment.statuses
+    for after in (revised(steps), revised(revised(steps))):
+        assert {step.alignment.status for step in after} == {AlignmentStatus.DEPTH_MISMATCH}
+
+
 def test_depth_that_became_wrong_and_was_told_says_nothing_of_the_run() -> None:
     """Ten frames of doubled depth had all pairs of a run flagged, those before and those after them too."""
 

@@ -12,12 +12,14 @@ from gavo_jax.alignment.result import no_alignment
 from gavo_jax.bodies.records import Body
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
+from gavo_jax.odometry.progress import Progress
 from gavo_jax.output.files import ODOMETRY
 from gavo_jax.output.masks import MASKS, read_masks, remove_masks, write_masks
 from gavo_jax.output.recorded_bodies import RecordedBodies
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.settings import OdometryOptions
 from gavo_jax.status import AlignmentStatus
+from gavo_jax.trajectory import stamp_name
 
 HEIGHT, WIDTH = 12, 16
 
@@ -158,5 +160,19 @@ def test_what_came_after_a_checkpoint_is_removed(tmp_path: Path):
     stamps = [index / 30 for index in (2, 3, 4)]
     for stamp in stamps:
         write_masks(tmp_path, replace(stepped(1, body(1, 0, 4)), timestamp=stamp))
-    remove_masks(tmp_path, after=stamps[0])
+    remove_masks(tmp_path, kept={stamp_name(stamps[0])})
     assert [path.name for path in (tmp_path / MASKS).iterdir()] == ["0.066667.png"]
+
+
+def test_a_run_whose_clock_was_set_back_goes_on_with_its_masks(tmp_path: Path):
+    """Those from before the clock was set back were taken for later than the checkpoint, and removed."""
+    config = {"odometry": OdometryOptions()}
+    with RunFolder(tmp_path) as folder:
+        folder.start(config, 1000.0)
+        folder.add(replace(stepped(1, body(1, 0, 4)), timestamp=1001.0))
+        folder.add(replace(stepped(2, body(1, 0, 4)), timestamp=500.0), Progress(last_index=2))
+        folder.save_checkpoint()
+        folder.add(replace(stepped(3, body(1, 0, 4)), timestamp=501.0))
+    with RunFolder(tmp_path) as folder:
+        assert folder.resume(config, {}) is not None
+    assert sorted(path.name for path in (tmp_path / MASKS).iterdir()) == ["1001.000000.png", "500.000000.png"]
