@@ -5,7 +5,7 @@ It checks each frame, has an aligner find its motion, decides what becomes of th
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
 import jax
@@ -21,13 +21,14 @@ from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Frame, FrameError, as_seconds, require_begin_in_seconds, require_grey_levels
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoWarning
-from gavo_jax.frame_checks import Finding, Use, check_frame, doubts_last_stamp
+from gavo_jax.frame_checks import Finding, Use, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt
 from gavo_jax.odometry.beginnings import begun, followed, revised_by
 from gavo_jax.odometry.composition import make_aligner, warm_up_wholly
 from gavo_jax.odometry.depth_watch import judge_by_depth, watch_from
 from gavo_jax.odometry.leaps import align_leaping
 from gavo_jax.odometry.misplaced import arrival_of, doubt_reference
+from gavo_jax.odometry.overlays import Sight
 from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.second_thoughts import without_depth
 from gavo_jax.odometry.way import Way
@@ -217,13 +218,9 @@ class Odometry:
         timestamp = as_seconds("timestamp", timestamp)
         frame = self._accepted(frame, timestamp)
         stopwatch = Stopwatch()
-        overlays, self.frame = self.progress.overlays, None
-        if isinstance(frame, Frame):
-            overlays = overlays.after(frame.grey, self.progress.world_T_camera)
-            self.frame = overlays.without(frame)
-            frame = replace(self.frame, depth=frame.depth)  # no fault of the sensor's
-        finding, history = check_frame(frame, timestamp, self.camera, self.progress.history)
-        before = self.progress._replace(last_index=self.progress.last_index + 1, history=history, overlays=overlays)
+        sight, here = Sight(self.progress.history, self.progress.overlays), self.progress.world_T_camera
+        sight, self.frame, finding = sight.after(frame, timestamp, self.camera, here)
+        before = self.progress._replace(last_index=self.progress.last_index + 1, **sight._asdict())
         usable = self.frame if finding.use is not Use.NOTHING else None
         if usable is not None and finding.use is Use.GREY:
             usable = without_depth(usable)

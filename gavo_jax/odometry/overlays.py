@@ -13,8 +13,10 @@ import cv2
 import numpy as np
 from jaxtyping import Num, UInt8
 
+from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.rectified import rectified_at
+from gavo_jax.frame_checks import Finding, History, Use, check_frame
 from gavo_jax.odometry.attached import Attached
 
 if TYPE_CHECKING:
@@ -99,6 +101,38 @@ class Overlays(NamedTuple):
         return replace(frame, grey=filled, depth=np.where(mask, depth.dtype.type(0), depth))
 
 
+class Sight(NamedTuple):
+    """What is known of a run's images before they are aligned."""
+
+    history: History = History()
+    """What the checks remember of them."""
+    overlays: Overlays = Overlays()
+    """What stays put in them."""
+
+    def after(
+        self, frame: Frame | FrameError | None, timestamp: float, camera: Camera, world_T_camera: np.ndarray
+    ) -> tuple[Self, Frame | None, Finding]:
+        """Look at one more frame; one that the checks refuse says nothing of overlays.
+
+        Args:
+            frame: The frame, without distortion, or why there is none.
+            timestamp: Its colour timestamp, seconds.
+            camera: Camera of the frame.
+            world_T_camera: The camera's pose at the frame before.
+
+        Returns:
+            What is known now; the frame without overlays, None where there is none; and the finding of the checks.
+        """
+        overlays, freed = self.overlays, None
+        if isinstance(frame, Frame):
+            overlays = overlays.after(frame.grey, world_T_camera)
+            freed = overlays.without(frame)
+            frame = replace(freed, depth=frame.depth)  # no fault of the sensor's
+        finding, history = check_frame(frame, timestamp, camera, self.history)
+        known = self.overlays if finding.use is Use.NOTHING else overlays
+        return self._replace(history=history, overlays=known), freed, finding
+
+
 class AsTracked:
     """Frames of a run as they were tracked, read again from the first one on.
 
@@ -108,7 +142,7 @@ class AsTracked:
     def __init__(self, sequence: Sequence, steps: Iterable["Step"], is_drawn_on: bool = True) -> None:
         self._sequence, self._is_drawn_on = sequence, is_drawn_on
         self._poses = {step.index: step.world_T_camera for step in steps}
-        self._overlays, self._next, self._pose = Overlays(), 0, np.eye(4)
+        self._camera, self._sight, self._next, self._pose = sequence.camera.rectified(), Sight(), 0, np.eye(4)
 
     def __getitem__(self, index: int) -> Frame:
         """A frame after those that were asked for before, without distortion and overlays.
@@ -118,17 +152,22 @@ class AsTracked:
         """
         for number in range(self._next, index) if self._is_drawn_on else ():
             with contextlib.suppress(FrameError):
-                self._look_at(rectified_at(self._sequence, number), number)
+                self._look_at(number)
         self._next = index + 1
-        frame = rectified_at(self._sequence, index)
-        if not self._is_drawn_on:
-            return frame
-        self._look_at(frame, index)
-        return self._overlays.without(frame)
+        return self._look_at(index) if self._is_drawn_on else rectified_at(self._sequence, index)
 
-    def _look_at(self, frame: Frame, index: int) -> None:
+    def _look_at(self, index: int) -> Frame:
+        """The frame as the driver saw it, which has seen those before."""
         self._pose = self._poses.get(index - 1, self._pose)
-        self._overlays = self._overlays.after(frame.grey, self._pose)
+        try:
+            frame = rectified_at(self._sequence, index)
+        except FrameError as error:
+            frame = error
+        stamp = float(self._sequence.timestamps[index])
+        self._sight, freed, _ = self._sight.after(frame, stamp, self._camera, self._pose)
+        if isinstance(frame, FrameError):
+            raise frame
+        return frame if freed is None else freed
 
 
 def _is_steep(image: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import small
-from driving import SEARCH_ALONE, Altered
+from driving import SEARCH_ALONE, Altered, Told, found
 from small import Rendered
 
 from gavo_jax.datasets.base import Frame, FrameError
@@ -18,6 +18,7 @@ from gavo_jax.odometry.overlays import FRAMES, AsTracked, Overlays
 from gavo_jax.odometry.run import run_odometry
 from gavo_jax.odometry.stream import track
 from gavo_jax.output.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from gavo_jax.status import AlignmentStatus
 
 ROOM = Rendered(FRAMES + 12, camera=small.CAMERA)
 
@@ -147,6 +148,25 @@ def test_frames_are_read_again_as_they_were_tracked() -> None:
         np.testing.assert_array_equal(plain[index].grey, sequence[index].grey)
     with pytest.raises(FrameError, match="torn"):
         AsTracked(sequence, steps)[4]
+
+
+BLIND = FRAMES + 5
+
+
+@pytest.mark.parametrize("seen_then", [np.zeros((120, 160)), np.random.default_rng(0).integers(0, 256, (120, 160))])
+def test_what_is_drawn_is_still_known_after_a_frame_that_is_refused(seen_then: np.ndarray) -> None:
+    """A black or noisy frame wiped it: the next eight frames, and keyframes made again, had the clock."""
+    grey = seen_then.astype(np.uint8)
+    sequence = Altered(ROOM, lambda i, frame: replace(frame, grey=grey) if i == BLIND else marked(i, frame))
+    odometry, shown, steps = Odometry(small.CAMERA, aligner=Told(found(AlignmentStatus.OK, 0.01))), [], []
+    for step in track(sequence, odometry=odometry, watch=lambda frame, _: shown.append(frame)):
+        steps.append(step)
+        assert odometry.progress.overlays.is_any == (step.index >= FRAMES), step.index
+    assert [step.index for step in steps if step.lost] == [BLIND]
+    again = AsTracked(sequence, steps)
+    for index in (FRAMES - 1, FRAMES, BLIND - 1, BLIND, BLIND + 1, len(ROOM) - 1):
+        np.testing.assert_array_equal(again[index].grey, shown[index].grey)
+        np.testing.assert_array_equal(again[index].depth, shown[index].depth)
 
 
 def test_a_resumed_run_makes_its_map_of_what_was_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
