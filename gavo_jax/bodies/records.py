@@ -17,7 +17,7 @@ class Seen(NamedTuple):
     """A body in one frame, as the camera sees it."""
 
     number: int
-    """Number of the body, from 1; the same in all frames."""
+    """Number of the body, from 1; the same in all frames since the aligner was started."""
     field: Float[np.ndarray, "h w"]
     """Segmentation on the level that bodies are seen on; positive where the body is."""
     share: float
@@ -35,7 +35,7 @@ class Body:
     """A body in one frame, in the world of the run."""
 
     number: int
-    """Number of the body, from 1; the same in all frames."""
+    """Number of the body, from 1; the same in all frames up to a break of the track, and no other body's."""
     share: float
     """Share of the image that it covers."""
     centroid: Float64[np.ndarray, " 3"]
@@ -77,6 +77,24 @@ class Body:
     def status(self) -> str:
         """The status of its motion in a word; `seen` where there is none."""
         return "seen" if self.alignment is None else str(self.alignment.status)
+
+
+class Numbering(NamedTuple):
+    """Numbers of a run's bodies: they go on where an aligner that is started again begins at 1."""
+
+    last: int = 0
+    """Largest number given so far."""
+    before: int = 0
+    """Largest number given before the aligner was last started."""
+
+    def given_to(self, seen: Seen) -> Seen:
+        """A body under the run's number."""
+        return seen._replace(number=self.before + seen.number)
+
+    def after(self, bodies: Iterable[Body], is_restarted: bool) -> Self:
+        """The numbering after a frame with some bodies, at which the aligner may have been started again."""
+        last = max([self.last, *(body.number for body in bodies)])
+        return self._replace(last=last, before=last if is_restarted else self.before)
 
 
 BORDER = 1 / 80

@@ -306,7 +306,10 @@ class Odometry:
         after = after._replace(leap=leap if after.held else None, arrival=kept if after.held else renewed)
         size = (self.camera.height, self.camera.width)
         since = before.world_T_reference if attempt.is_found else None
-        bodies = tuple(in_world(seen, after.world_T_camera, since, size) for seen in attempt.bodies)
+        numbered = map(before.numbering.given_to, attempt.bodies)
+        bodies = tuple(in_world(seen, after.world_T_camera, since, size) for seen in numbered)
+        is_restarted = lost and after.tracker is not before.tracker
+        after = after._replace(numbering=before.numbering.after(bodies, is_restarted))
         revises = attempt.revises
         if not lost:
             shown, is_reference = sum(seen.share for seen in attempt.bodies), after.tracker is not before.tracker

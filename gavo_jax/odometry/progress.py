@@ -5,6 +5,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from jaxtyping import Float64
 
+from gavo_jax.bodies.records import Numbering
 from gavo_jax.datasets.base import Frame
 from gavo_jax.frame_checks import History
 from gavo_jax.odometry.aligners import expecting
@@ -54,6 +55,8 @@ class Progress(NamedTuple):
     """What is known of the reference's depth, and how depth has changed; None before the first reference."""
     overlays: Overlays = Overlays()
     """What stays put in every image."""
+    numbering: Numbering = Numbering()
+    """Numbers of the bodies so far."""
 
     def tracker_at(self, timestamp: float) -> Any:
         """The aligner's state for a frame at a timestamp, with the motion predicted from the way so far."""

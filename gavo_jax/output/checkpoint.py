@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gavo_jax.bodies.records import Numbering
 from gavo_jax.camera import MAX_SIDE
 from gavo_jax.depth_edges import DepthEdges
 from gavo_jax.errors import GavoError, write_bytes
@@ -80,6 +81,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "leap": progress.leap and [progress.leap.target_T_reference.tolist(), *progress.leap[1:]],
         "arrival": progress.arrival and [np.asarray(part).tolist() for part in progress.arrival],
         "beginning": progress.beginning,
+        "numbering": progress.numbering,
         "depth": watch and [watch.change[1:], watch.edges[1:], watch.found_wrong],
         "history": progress.history._asdict(),
         "files": checkpoint.files,
@@ -152,6 +154,7 @@ def _progress_of(numbers: dict[str, Any], arrays: dict[str, np.ndarray]) -> Prog
         "arrival": came and Arrival(np.array(came[0]), np.array(came[1]), *came[2:]),
         "way": Way(tuple(Fix(seconds, tuple(xi)) for seconds, xi in numbers["way"])),
         "beginning": beginning and Beginning(*beginning),
+        "numbering": Numbering(*numbers.get("numbering", ())),
     }
     if depth := numbers.get("depth"):
         (delay, *known), seen, told = depth
