@@ -6,6 +6,7 @@ millisecond. A failed check gives the frame an `AlignmentStatus` and says what i
 
 import enum
 import math
+import warnings
 import zlib
 from statistics import median
 from typing import NamedTuple
@@ -16,6 +17,7 @@ import numpy as np
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.datasets.depth_unit import PLAUSIBLE, is_unusual
+from gavo_jax.errors import GavoWarning
 from gavo_jax.status import AlignmentStatus
 
 
@@ -113,6 +115,8 @@ MAX_USUAL_INTERVAL = 1.5
 """Ratio of an interval to the usual one above which it may span two frames."""
 MIN_INTERVALS = 3
 """Number of known intervals before one can be unusual."""
+LONGEST_INTERVAL = 1e3
+"""If the first intervals are all longer than so many seconds, the timestamps are hardly in seconds."""
 ROW_STEP = 4
 THUMBNAIL = 5
 """Smallest side of the thumbnail in pixels, if the image has as many."""
@@ -184,6 +188,19 @@ def doubts_last_stamp(timestamp: float, history: History) -> bool:
     *before, last = (0.0, 0.0) if len(history.intervals) <= MIN_INTERVALS else history.intervals
     early = history.timestamp is not None and history.timestamp - last < timestamp < history.timestamp
     return early and last > MAX_USUAL_INTERVAL * median(before)
+
+
+def doubt_unit_of_time(index: int, history: History) -> None:
+    """Warn, at the fourth frame of a run alone, if its timestamps are hardly in seconds.
+
+    Args:
+        index: Index of the frame in the run.
+        history: History with that frame.
+    """
+    intervals = history.intervals
+    if index == MIN_INTERVALS == len(intervals) and (least := min(intervals)) > LONGEST_INTERVAL:
+        fault = f"timestamps: expected seconds, but the first frames are {least:.0f} s and more apart"
+        warnings.warn(f"{fault}: motions are not checked for being too fast", GavoWarning, stacklevel=4)
 
 
 def check_images(grey: np.ndarray, depth: np.ndarray, depth_scale: float) -> tuple[AlignmentStatus, ...]:

@@ -21,7 +21,7 @@ from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Frame, FrameError, as_seconds, require_begin_in_seconds, require_grey_levels
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoWarning
-from gavo_jax.frame_checks import Finding, Use, doubts_last_stamp
+from gavo_jax.frame_checks import Finding, Use, doubt_unit_of_time, doubts_last_stamp
 from gavo_jax.odometry.aligners import Aligner, Attempt
 from gavo_jax.odometry.beginnings import begun, followed, revised_by
 from gavo_jax.odometry.composition import make_aligner, warm_up_wholly
@@ -221,6 +221,7 @@ class Odometry:
         sight, here = Sight(self.progress.history, self.progress.overlays), self.progress.world_T_camera
         sight, self.frame, finding = sight.after(frame, timestamp, self.camera, here)
         before = self.progress._replace(last_index=self.progress.last_index + 1, **sight._asdict())
+        doubt_unit_of_time(before.last_index, before.history)
         usable = self.frame if finding.use is not Use.NOTHING else None
         if usable is not None and finding.use is Use.GREY:
             usable = without_depth(usable)
@@ -308,8 +309,7 @@ class Odometry:
         since = before.world_T_reference if attempt.is_found else None
         numbered = map(before.numbering.given_to, attempt.bodies)
         bodies = tuple(in_world(seen, after.world_T_camera, since, size) for seen in numbered)
-        is_restarted = lost and after.tracker is not before.tracker
-        after = after._replace(numbering=before.numbering.after(bodies, is_restarted))
+        after = after._replace(numbering=before.numbering.after(bodies, lost and after.tracker is not before.tracker))
         revises = attempt.revises
         if not lost:
             shown, is_reference = sum(seen.share for seen in attempt.bodies), after.tracker is not before.tracker
