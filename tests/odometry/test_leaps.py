@@ -74,10 +74,10 @@ def follow(numbers: list[int]) -> list[Step]:
 
 @pytest.fixture
 def all_frames_are_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    from gavo_jax.odometry import driver
+    from gavo_jax.odometry import overlays
 
-    whole = driver.Finding(Status.OK, driver.Use.ALL)
-    monkeypatch.setattr(driver, "check_frame", lambda frame, timestamp, camera, history: (whole, history))
+    whole = overlays.Finding(Status.OK, overlays.Use.ALL)
+    monkeypatch.setattr(overlays, "check_frame", lambda frame, timestamp, camera, history: (whole, history))
 
 
 def places(steps: list[Step]) -> list[float]:
