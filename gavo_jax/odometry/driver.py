@@ -308,12 +308,8 @@ class Odometry:
         after = after._replace(leap=leap if after.held else None, arrival=kept if after.held else renewed)
         size = (self.camera.height, self.camera.width)
         since = before.world_T_reference if attempt.is_found else None
-<<<<<<< HEAD
         trusted = () if lost else attempt.bodies  # a lost search takes for one what does not fit its wrong motion
         numbered = map(before.numbering.given_to, trusted)
-=======
-        numbered = map(before.numbering.given_to, attempt.bodies)
->>>>>>> w-odo
         bodies = tuple(in_world(seen, after.world_T_camera, since, size) for seen in numbered)
         after = after._replace(numbering=before.numbering.after(bodies, lost and after.tracker is not before.tracker))
         revises = attempt.revises
