@@ -74,6 +74,13 @@ def test_a_hidden_body_keeps_its_number_for_a_while() -> None:
     assert associate(at(BOX), forgotten).numbers[0] == 2, "no number is given twice"
 
 
+def test_a_body_that_moves_is_no_longer_where_it_was() -> None:
+    moved = np.s_[14:34, 16:36]
+    after = associate(at(moved), associate(at(BOX), BodyTracks.empty((60, 80))))
+    np.testing.assert_array_equal(after.labels, at(moved))
+    assert after.numbers.tolist() == [1] + [0] * 7 and not after.ages.any()
+
+
 def test_a_hidden_body_is_not_what_comes_near_its_place() -> None:
     """Only what was there in the last frame can have gone so far since."""
     near = np.s_[20:40, 24:34]

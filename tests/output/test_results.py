@@ -213,8 +213,9 @@ def test_a_finished_run_is_whole(tmp_path: Path, name: str) -> None:
 def test_the_steps_of_a_run_come_back_as_they_were(tmp_path: Path) -> None:
     """Of a camera that turns: catches motions between the wrong poses or the wrong way round, and a lost origin."""
     poses = [exp(np.array([0.3, -0.1, 0.2, 0.1, -0.4, 0.3]) * i) @ exp(np.eye(6)[i % 6]) for i in range(5)]
-    references, steps = (0, 1, 0, 3), []
-    origins: tuple[Any, ...] = ("tracked", "guessed", "relocalised", "tracked")
+    references = (0, 1, 0, 3)
+    origins: Any = ("tracked", "guessed", "relocalised", "tracked")
+    steps = []
     for i, (reference, origin) in enumerate(zip(references, origins, strict=True), start=1):
         result = no_alignment(AlignmentStatus.OK if i < 4 else AlignmentStatus.LOW_TEXTURE)._replace(
             target_T_reference=inverse(poses[i]) @ poses[reference],
