@@ -201,7 +201,7 @@ class Mapper:
     def _join(self) -> bool:
         """Tie segments, or those tied to each other, to earlier ones, until no more can be; whether any was tied."""
         kept, asked, joined = self.keyframes.searchable(), {}, 0
-        while True:
+        for _ in {keyframe.segment for keyframe in kept}:
             first = tied_segments(self.keyframes.all, self.edges)
             for root in sorted(set(first.values())):
                 own = [keyframe for keyframe in kept if first[keyframe.segment] == root]
@@ -211,7 +211,8 @@ class Mapper:
                     break
                 asked[root] = len(own), len(others)
             else:
-                return joined > 0
+                break
+        return joined > 0
 
     def _tie_to(self, own: list[Keyframe], others: list[Keyframe]) -> bool:
         """Tie some keyframes to others by the first or last of each of their segments; whether one was found."""
