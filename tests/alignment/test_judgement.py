@@ -61,7 +61,9 @@ def test_what_speaks_against_a_motion_whatever_the_images(scale: float, asked: i
     information = Information(jnp.eye(6), 1e4 * jnp.ones(6), jnp.ones(6, bool))
     explained = ExplainedShare(jnp.float32(1.0), jnp.float32(1.0))
     reference = SimpleNamespace(points=points, grey=jnp.arange(100.0))
-    objective: Any = SimpleNamespace(scales=Scales.unit(), reference=reference)
+    objective: Any = SimpleNamespace(
+        scales=Scales.unit(), reference=reference, is_out_of_view=lambda overlap: overlap < 0.35
+    )
 
     @jax.jit
     def judge(motion: jax.Array) -> jax.Array:
