@@ -18,9 +18,9 @@ from typing import Any
 import common
 
 from gavo_jax.errors import GavoError
-from gavo_jax.experiments.record import FILE as PLAN
 from gavo_jax.experiments.summary import compare, summarise
 from gavo_jax.experiments.table import Table
+from gavo_jax.output.files import EXPERIMENT
 from gavo_jax.output.screen import number
 
 COLUMNS = ("method", "runs", "m/s", "from", "to", "printed", "deg/s")
@@ -39,7 +39,7 @@ def main(results: Path = Path("runs/table1"), json: Path | None = None) -> dict[
     table = Table(results)
     if not table.done():
         raise GavoError(f"{results}: no results: run `gavo experiment examples/table1.toml` first")
-    rows, plan = table.read(), json_files.loads((results / PLAN).read_text(encoding="utf-8"))
+    rows, plan = table.read(), json_files.loads((results / EXPERIMENT).read_text(encoding="utf-8"))
     printed = {(entry["sequence"], entry["label"]): entry["drift"] for entry in plan["printed"]}
     order = [tuple(entry) for entry in plan["order"]]
     rows.sort(key=lambda row: (order.index((row["sequence"], row["label"])), row["seed"] or 0))

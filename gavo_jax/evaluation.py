@@ -1,5 +1,6 @@
 """Errors of a trajectory against the truth: relative pose error (15)(16), absolute error, distance error (17)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -245,7 +246,7 @@ def _relative_pose_error_seconds(estimate: Trajectory, truth: Trajectory, delta:
     estimated, true = estimate.world_T_camera, truth.world_T_camera[nearest]
     end_T_start = inverse(estimated[end]) @ estimated[start]
     true_end_T_start = inverse(true[end]) @ true[start]
-    reach = "" if not is_sparse else f" within {MAX_DIFFERENCE:g} s"
+    reach = f" within {MAX_DIFFERENCE:g} s" if is_sparse else ""
     definition = f"inv(est_j_T_i) @ true_j_T_i over {delta:g} s (TUM evaluate_rpe.py, fixed delta), nearest true stamps"
     definition += reach
     error = inverse(end_T_start) @ true_end_T_start
@@ -329,3 +330,9 @@ def _closest_index(sorted_stamps: Float[np.ndarray, " n"], queries: Float[np.nda
         above = stamp > queries
         low, high = np.where((low < high) & ~above, middle + 1, low), np.where((low < high) & above, middle, high)
     return best
+
+
+def quantiles_of(errors: Sequence[float] | Float[np.ndarray, " n"], shares: Sequence[float]) -> list[float]:
+    """Quantiles of errors, which are infinite where a camera was lost: nothing lies between a number and infinity."""
+    method = "linear" if np.all(np.isfinite(errors)) else "higher"
+    return np.quantile(errors, shares, method=method).tolist()

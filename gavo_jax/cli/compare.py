@@ -119,8 +119,7 @@ def compare(options: Compare) -> int:
     peers = {one.method: peer_odometry(one.method, sequence.camera) for one in contenders if one.preset is None}
     folder = prepare_folder(options.output or Path("runs") / f"{sequence.name}-compare-{options.preset}")
     with hold(folder):
-        refuse_foreign(folder, FRAMES, "a run")
-        refuse_foreign(folder, EXPERIMENT, "an experiment")
+        refuse_foreign(folder, FRAMES, EXPERIMENT)
         if (folder / COMPARISON).exists():
             say(f"the earlier comparison in {folder} is replaced")
         else:
@@ -324,10 +323,9 @@ def _versions(entries: list[Entry]) -> dict[str, str]:
 def _rows(entries: list[Entry], typical: list[Entry]) -> list[list[Any]]:
     rows = []
     for run in typical:
-        drifts = [entry.metrics[DRIFT] for entry in entries if entry.label == run.label]
-        span = [np.inf if drift is None else drift for drift in drifts]
+        drifts = [drifts_of(entry.metrics)[0] for entry in entries if entry.label == run.label]
         cells = [number(_shown(run.metrics, key), digits) for _, key, digits in COLUMNS]
-        span = [number(found if (found := extreme(span)) < np.inf else None) for extreme in (min, max)]
+        span = [number(found if (found := extreme(drifts)) < np.inf else None) for extreme in (min, max)]
         path, end = path_and_end(run.trajectory)
         is_all = run.metrics[DRIFT_PER_FRAME] is None
         of_path = [number(path), end or DASH] if is_all else [DASH] * len(PATH_COLUMNS)

@@ -67,8 +67,7 @@ def _check(options: Evaluate) -> None:
         return
     if not plots.available():
         raise GavoError("--plot: matplotlib is not installed: pip install 'gavo-jax[plot]'")
-    for file, what in ((FRAMES, "a run"), (COMPARISON, "a comparison")):
-        refuse_foreign(options.plot, file, what)
+    refuse_foreign(options.plot, FRAMES, COMPARISON)
 
 
 def _remarks(paths: tuple[Path, Path], read: list[tuple[Trajectory, float]]) -> Iterator[str]:

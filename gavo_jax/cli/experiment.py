@@ -54,8 +54,7 @@ def experiment(options: Experiment) -> int:
 
 def _refuse_foreign(folder: Path, table: Table) -> None:
     """Refuse a folder with other results, or with files that the report would replace and no experiment wrote."""
-    for file, what in ((FRAMES, "a run"), (COMPARISON, "a comparison")):
-        refuse_foreign(folder, file, what)
+    refuse_foreign(folder, FRAMES, COMPARISON)
     if not (read_record(folder).runs or table.done()):
         figures = (name for name in FIGURE_NAMES if name.startswith(f"{FIGURE}."))
         refuse_strange(folder, (EXPERIMENT, PAGE, *figures), "an experiment")

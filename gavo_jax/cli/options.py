@@ -83,6 +83,11 @@ class SearchOptions:
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=VALUE", help_behavior_hint="(repeatable)")] = ()
     """A single setting, such as alignment.points=2400 or solver.population.4=32."""
 
+    @property
+    def base(self) -> tuple[str, str]:
+        """Method and preset, those that stand for none included."""
+        return self.method or "ga", self.preset or "default"
+
 
 @dataclass(frozen=True)
 class Run(SearchOptions, Source):

@@ -238,7 +238,7 @@ def _track(
     folder.finish(metrics, complete=not tracked.interrupted)
 
     def draw_figures() -> None:
-        _draw(options.method or "ga", folder, outcome.trajectory, outcome.odometry, sequence.ground_truth)
+        _draw(options.base[0], folder, outcome.trajectory, outcome.odometry, sequence.ground_truth)
         draw_search(folder.path, sequence, odometry, revised(tracked.steps))
 
     with waiting("drawing figures …"):
@@ -265,4 +265,4 @@ def _draw_if_missing(options: Run, sequence: Sequence, folder: RunFolder) -> Non
     )
     if trajectory is not None:
         with waiting("drawing figures …"):
-            interruptible(lambda: _draw(options.method or "ga", folder, trajectory, odometry, sequence.ground_truth))
+            interruptible(lambda: _draw(options.base[0], folder, trajectory, odometry, sequence.ground_truth))

@@ -71,7 +71,7 @@ def choose_settings(search: SearchOptions) -> NamedSettings:
     Raises:
         GavoError: the method, the file or a single setting is invalid.
     """
-    method, preset = search.method or "ga", search.preset or "default"
+    method, preset = search.base
     if method not in presets.methods():
         raise GavoError(f"--method: {method!r} is not one of {', '.join(presets.usable_methods())}")
     if search.settings is None:
@@ -95,23 +95,17 @@ SHORTCUTS = ("reference", "on_lost", "bodies", "loops")
 
 def with_shortcuts(settings: Settings, options: Run) -> Settings:
     """Return the settings with the dedicated options (`--reference`, `--on-lost`, `--bodies`, `--loops`) applied."""
-    for name in set(assignments(options.set)) & {f"odometry.{name}" for name in SHORTCUTS}:
-        option = name.partition(".")[2]
-        if getattr(options, option):
-            raise GavoError(f"--{option.replace('_', '-')}: --set {name} says the same: omit one of them")
-    odometry = settings.odometry
-    if options.reference is not None:
-        odometry = replace(odometry, reference=options.reference)
-    if options.on_lost is not None:
-        odometry = replace(odometry, on_lost=options.on_lost)
-    if options.bodies is not None:
-        odometry = replace(odometry, bodies=options.bodies)
-    return replace(settings, odometry=replace(odometry, loops=odometry.loops or options.loops))
+    given: dict[str, Any] = {name: value for name in SHORTCUTS if (value := getattr(options, name))}
+    for name in given:
+        if f"odometry.{name}" in assignments(options.set):
+            option = name.replace("_", "-")
+            raise GavoError(f"--{option}: --set odometry.{name} says the same: omit one of them")
+    return replace(settings, odometry=replace(settings.odometry, **given))
 
 
 def unchanged_preset(settings: Settings, options: Run) -> str | None:
     """Return the name of a run's preset; None if more than the dedicated options has changed its settings."""
-    unchanged = with_shortcuts(presets.preset(options.method or "ga", options.preset or "default"), options)
+    unchanged = with_shortcuts(presets.preset(*options.base), options)
     return options.preset if presets.are_same(settings, unchanged) else None
 
 

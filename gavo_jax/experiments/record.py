@@ -8,8 +8,6 @@ from gavo_jax.errors import GavoError, read_json_object
 from gavo_jax.experiments.plan import Plan
 from gavo_jax.output.files import EXPERIMENT, write_json
 
-FILE = EXPERIMENT
-
 
 class Record(NamedTuple):
     """What a report needs to know of an experiment in addition to its table."""
@@ -28,7 +26,7 @@ def write_record(plan: Plan) -> None:
     order = list(dict.fromkeys((run.part.name, run.label) for run in plan.runs))
     printed = [{"sequence": name, "label": label, "drift": value} for (name, label), value in plan.printed.items()]
     runs = [run.id for run in plan.runs]
-    write_json(plan.folder / FILE, {"name": plan.name, "order": order, "printed": printed, "runs": runs})
+    write_json(plan.folder / EXPERIMENT, {"name": plan.name, "order": order, "printed": printed, "runs": runs})
 
 
 def read_record(folder: Path) -> Record:
@@ -37,7 +35,7 @@ def read_record(folder: Path) -> Record:
     Raises:
         GavoError: The record cannot be read.
     """
-    path = folder / FILE
+    path = folder / EXPERIMENT
     if not path.is_file():
         return Record("", {}, {}, frozenset())
     record = read_json_object(path)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gavo_jax.evaluation import quantiles_of
 from gavo_jax.odometry.metrics import DRIFT, DRIFT_PER_FRAME, FRAMES_PER_SECOND, drifts_of
 
 ALL = "all sequences"
@@ -61,8 +62,7 @@ def summarise(rows: Iterable[Row]) -> list[Summary]:
 def _summary(sequence: str, label: str, rows: Sequence[Row]) -> Summary:
     drifts, turns = zip(*map(drifts_of, rows), strict=True)
     steps = [row[DRIFT_PER_FRAME] for row in rows if row[DRIFT_PER_FRAME] is not None]
-    method = "linear" if np.all(np.isfinite(drifts)) else "higher"  # nothing lies between a number and infinity
-    quartiles = np.quantile(drifts, (0.25, 0.5, 0.75), method=method).tolist() if min(drifts) < np.inf else None
+    quartiles = quantiles_of(drifts, (0.25, 0.5, 0.75)) if min(drifts) < np.inf else None
     return Summary(
         sequence,
         label,

@@ -200,19 +200,19 @@ class Mapper:
 
     def _join(self) -> bool:
         """Tie segments, or those tied to each other, to earlier ones, until no more can be; whether any was tied."""
-        kept, asked, joined = self.keyframes.searchable(), {}, 0
+        kept, asked, joined = self.keyframes.searchable(), {}, False
         for _ in {keyframe.segment for keyframe in kept}:
             first = tied_segments(self.keyframes.all, self.edges)
             for root in sorted(set(first.values())):
                 own = [keyframe for keyframe in kept if first[keyframe.segment] == root]
                 others = [keyframe for keyframe in kept if first[keyframe.segment] < root]
                 if asked.get(root) != (len(own), len(others)) and self._tie_to(own, others):
-                    joined += 1
+                    joined = True
                     break
                 asked[root] = len(own), len(others)
             else:
                 break
-        return joined > 0
+        return joined
 
     def _tie_to(self, own: list[Keyframe], others: list[Keyframe]) -> bool:
         """Tie some keyframes to others by the first or last of each of their segments; whether one was found."""
@@ -220,8 +220,8 @@ class Mapper:
             return False
         for segment in dict.fromkeys(keyframe.segment for keyframe in own):
             ones = [keyframe for keyframe in own if keyframe.segment == segment]
-            ends = (*ones[:SOUGHT_OF_SEGMENT], *ones[SOUGHT_OF_SEGMENT:][: -SOUGHT_OF_SEGMENT - 1 : -1])
-            for keyframe in ends:
+            first, rest = ones[:SOUGHT_OF_SEGMENT], ones[SOUGHT_OF_SEGMENT:]
+            for keyframe in (*first, *reversed(rest[-SOUGHT_OF_SEGMENT:])):
                 place = self.recogniser.find(keyframe, others)
                 if place is not None:
                     later = max(keyframe, place.keyframe, key=lambda one: one.number)
@@ -346,7 +346,7 @@ def _own_velocity(step: Step) -> Float64[np.ndarray, " 6"]:
     seconds, result = step.timestamp - step.reference_timestamp, step.alignment
     if seconds <= 0 or AlignmentStatus.IMPLAUSIBLE_MOTION in result.statuses or is_unknown(result):
         return np.zeros(6)
-    motion, sway = (np.asarray(of, np.float64) for of in (step.alignment.target_T_reference, step.alignment.sway))
+    motion, sway = (np.asarray(of, np.float64) for of in (result.target_T_reference, result.sway))
     return (log(motion) + sway) / max(seconds, 1e-3)
 
 

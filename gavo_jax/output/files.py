@@ -118,19 +118,23 @@ def prepare_folder(folder: str | Path) -> Path:
     return folder
 
 
-def refuse_foreign(folder: Path, file: str, what: str) -> None:
+KINDS = {FRAMES: "a run", COMPARISON: "a comparison", EXPERIMENT: "an experiment"}
+"""Kinds of results, by a file that identifies them."""
+
+
+def refuse_foreign(folder: Path, *files: str) -> None:
     """Refuse a folder that holds results of another kind, as their figures have the same names.
 
     Args:
         folder: The folder.
-        file: Name of a file that identifies those results.
-        what: Kind of those results, for the message.
+        files: Which of `KINDS` are refused.
 
     Raises:
-        GavoError: The file exists.
+        GavoError: One of the files exists.
     """
-    if (folder / file).exists():
-        raise GavoError(f"{folder}: contains {what} ({file}): choose another folder")
+    for file in files:
+        if (folder / file).exists():
+            raise GavoError(f"{folder}: contains {KINDS[file]} ({file}): choose another folder")
 
 
 def refuse_strange(folder: Path, patterns: Iterable[str], what: str) -> None:

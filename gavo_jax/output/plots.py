@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.errors import write_bytes
-from gavo_jax.evaluation import ErrorSeries
+from gavo_jax.evaluation import ErrorSeries, quantiles_of
 from gavo_jax.output.figure_parts import (
     COLORS,
     add_legend,
@@ -315,8 +315,7 @@ def plot_drift(clips: Mapping[str, Mapping[str, Float[np.ndarray, "runs 2"]]], o
             for place, (name, runs) in enumerate(methods.items()):
                 values = runs[np.isfinite(runs[:, column]), column]
                 lost = len(runs) - len(values)
-                # nothing lies between a number and infinity
-                middle = float(np.quantile(runs[:, column], 0.5, method="higher" if lost else "linear"))
+                (middle,) = quantiles_of(runs[:, column], [0.5])
                 if not np.isfinite(middle):
                     axes.annotate(f" no drift in {lost} of {len(runs)}", (0, place), va="center", fontsize=7)
                     continue

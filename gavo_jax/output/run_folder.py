@@ -163,7 +163,7 @@ class RunFolder:
 
     def _refuse_foreign(self) -> None:
         """Refuse a folder with a comparison, or with files that this run would replace and no earlier run wrote."""
-        refuse_foreign(self.path, COMPARISON, "a comparison")
+        refuse_foreign(self.path, COMPARISON)
         try:
             is_of_run = "odometry" in read_json_object(self.path / CONFIG)
         except GavoError:
