@@ -124,7 +124,7 @@ class WithRival:
         if other is not None and other.usable:
             aged = rival._replace(age=rival.age.later(elapsed))
             if attempt.usable:
-                return self._decide(attempt, other, aged, open_for)
+                return _reopened(self._decide(attempt, other, aged, open_for), open_for)
             depth_is_doubted = AlignmentStatus.DEPTH_MISMATCH in attempt.result.statuses
             if other.deviation < EXACT and not depth_is_doubted:  # that motion is lost; whose it was stays open
                 return self._taken(other, aged, open_for, open_for, clearly=True)
@@ -132,7 +132,7 @@ class WithRival:
             rival = self._nobody
         elif other is not None:
             rival = self._rival_of(attempt.state) if float(open_for.seconds) < DROPPED_AFTER else self._nobody
-        return _open(attempt, open_for)._replace(state=RivalledState(attempt.state, rival, open_for))
+        return _reopened(attempt._replace(state=RivalledState(attempt.state, rival, open_for)), open_for)
 
     def _called(self, state: RivalledState, attempt: Attempt) -> tuple[Rival, Span]:
         """The rival, and how long the first motion has been in question.
@@ -230,10 +230,12 @@ class WithRival:
         )
 
 
-def _open(attempt: Attempt, open_for: Span) -> Attempt:
-    """Mark an attempt's motion as unknown if it may be a body's and earlier ones may be, too."""
-    doubted = open_for.lasts and AlignmentStatus.MOVING_BODY in attempt.result.statuses
-    return attempt._replace(unknown=1) if doubted else attempt
+def _reopened(attempt: Attempt, open_for: Span) -> Attempt:
+    """Mark an attempt's motion as unknown, and all since the question was opened, if it may be a body's."""
+    if attempt.revises or not open_for.lasts or AlignmentStatus.MOVING_BODY not in attempt.result.statuses:
+        return attempt
+    earlier = max(int(open_for.frames) - 1, 0)
+    return attempt._replace(unknown=earlier + 1, revises=earlier, state=attempt.state._replace(open_for=BEGUN))
 
 
 def _view(state: AwareState) -> View:
