@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float64
 
 from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import Alignment
-from gavo_jax.bodies.aligner import BodyAware, mistrusted
+from gavo_jax.bodies.aligner import SUSPECTED, BodyAware, mistrusted
 from gavo_jax.bodies.duel import BEGUN, DROPPED_AFTER, EXACT, OVER, Duel, Motions, Span, leads
 from gavo_jax.bodies.identity import BodyTracks
 from gavo_jax.bodies.pixel_evidence import View, inverse_depth_of
@@ -124,7 +124,7 @@ class WithRival:
         if other is not None and other.usable:
             aged = rival._replace(age=rival.age.later(elapsed))
             if attempt.usable:
-                return _reopened(self._decide(attempt, other, aged, open_for), open_for)
+                return self._reopened(self._decide(attempt, other, aged, open_for), open_for, frame)
             depth_is_doubted = AlignmentStatus.DEPTH_MISMATCH in attempt.result.statuses
             if other.deviation < EXACT and not depth_is_doubted:  # that motion is lost; whose it was stays open
                 return self._taken(other, aged, open_for, open_for, clearly=True)
@@ -132,7 +132,16 @@ class WithRival:
             rival = self._nobody
         elif other is not None:
             rival = self._rival_of(attempt.state) if float(open_for.seconds) < DROPPED_AFTER else self._nobody
-        return _reopened(attempt._replace(state=RivalledState(attempt.state, rival, open_for)), open_for)
+        return self._reopened(attempt._replace(state=RivalledState(attempt.state, rival, open_for)), open_for, frame)
+
+    def _reopened(self, attempt: Attempt, open_for: Span, frame: Frame) -> Attempt:
+        """Start anew where a motion may be a body's while the question is open: all since then is unknown."""
+        if attempt.revises or not open_for.lasts or AlignmentStatus.MOVING_BODY not in attempt.result.statuses:
+            return attempt
+        earlier = max(int(open_for.frames) - 1, 0)
+        known = np.any(np.asarray(attempt.state.first.scene.suspected) > SUSPECTED)
+        after = attempt.state._replace(open_for=BEGUN) if known else self.start(frame)
+        return attempt._replace(unknown=earlier + 1, revises=earlier, state=after)
 
     def _called(self, state: RivalledState, attempt: Attempt) -> tuple[Rival, Span]:
         """The rival, and how long the first motion has been in question.
@@ -228,14 +237,6 @@ class WithRival:
         return self._nobody._replace(
             state=seen, anchor=anchor, near=near, stands_before=np.bool_(stands_before), age=BEGUN
         )
-
-
-def _reopened(attempt: Attempt, open_for: Span) -> Attempt:
-    """Mark an attempt's motion as unknown, and all since the question was opened, if it may be a body's."""
-    if attempt.revises or not open_for.lasts or AlignmentStatus.MOVING_BODY not in attempt.result.statuses:
-        return attempt
-    earlier = max(int(open_for.frames) - 1, 0)
-    return attempt._replace(unknown=earlier + 1, revises=earlier, state=attempt.state._replace(open_for=BEGUN))
 
 
 def _view(state: AwareState) -> View:
