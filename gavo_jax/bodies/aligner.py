@@ -32,7 +32,7 @@ from gavo_jax.odometry.aligners import (
     is_motion_known,
     side_by_side,
 )
-from gavo_jax.odometry.plausibility import depth_alone_disagrees
+from gavo_jax.odometry.plausibility import depth_alone_disagrees, possible_change
 from gavo_jax.odometry.tracking import Clock, TrackerState, as_exposed
 from gavo_jax.rigid_motions import exp, log
 from gavo_jax.status import AlignmentStatus, bit
@@ -48,11 +48,17 @@ MAX_DISSENT_RATIO = 2.0
 """Ratio of a motion's dissent to the least dissent from any motion, above which another one is searched for."""
 MIN_REPLACEMENT_RATIO = 1.2
 """Ratio of a motion's dissent to that from its replacement, from which on the replacement is taken."""
-MISTRUSTED, MISTRUSTED_BESIDE_BODIES = 18.0, 12.0
-"""Dissents above which a motion may be a body's, without bodies in view and with some. With pure noise the median block
-gains 5.3, the median of chi-squared with six degrees of freedom. Real clips have about 9 in the median pair and 17 in
-the worst.
+MISTRUSTED, MISTRUSTED_STRICTLY = 18.0, 12.0
+"""Dissents above which a motion may be a body's; the second one applies beside bodies and to motions that jump. With
+pure noise the median block gains 5.3, the median of chi-squared with six degrees of freedom. Real clips have about 9 in
+the median pair and 17 in the worst.
 """
+JUMP = 0.5
+"""Change of the translation, over the largest that is plausible, above which a motion jumps: as it does where the
+search leaves a body for the scene.
+"""
+JUMP_TOLERANCE = 0.004
+"""Errors of two motions, metres."""
 GAIN = 0.01
 """Gain in support that a round needs for another one to follow."""
 LARGE = 0.25
@@ -212,9 +218,9 @@ class BodyAware:
         """Complete an attempt with its bodies and the state after it; nothing is learnt from a motion in doubt."""
         scene, segmenter = state.scene, self.segmenter
         dissent = 0.0 if look.opinion is None else float(look.opinion.dissent)
-        if dissent > MISTRUSTED:
+        if dissent > (MISTRUSTED_STRICTLY if self._jumps(state, clock, attempt) else MISTRUSTED):
             attempt = mistrusted(attempt)
-        limit = MISTRUSTED_BESIDE_BODIES if np.any(found) else MISTRUSTED
+        limit = MISTRUSTED_STRICTLY if np.any(found) else MISTRUSTED
         is_doubted = dissent > limit or AlignmentStatus.MOVING_BODY in attempt.result.statuses
         tracks, bodies, seen = BodyTracks(*map(np.asarray, scene.tracks)), found, ()
         if np.any(found) or np.any(tracks.numbers):
@@ -259,6 +265,14 @@ class BodyAware:
                 break
             attempt, look = again, other
         return attempt, look
+
+    def _jumps(self, state: AwareState, clock: Clock, attempt: Attempt) -> bool:
+        """Whether the camera's velocity seems to change faster than a hand changes it."""
+        if not is_motion_known(state.tracker):
+            return False
+        change = inverse(np.asarray(attempt.result.target_T_reference)) @ self.predict(state, float(clock.elapsed))
+        possible = possible_change(float(clock.elapsed), float(state.tracker.seconds))[0]
+        return bool(np.linalg.norm(change[:3, 3]) > JUMP * possible + JUMP_TOLERANCE)
 
     def _look(self, state: AwareState, clock: Clock, attempt: Attempt) -> FrameView:
         return self.segmenter.look(state.scene, attempt.state, attempt.result.target_T_reference, float(clock.elapsed))
