@@ -32,7 +32,7 @@ from gavo_jax.odometry.aligners import (
     is_motion_known,
     side_by_side,
 )
-from gavo_jax.odometry.plausibility import depth_alone_disagrees, possible_change
+from gavo_jax.odometry.plausibility import depth_alone_disagrees, is_abrupt
 from gavo_jax.odometry.tracking import Clock, TrackerState, as_exposed
 from gavo_jax.rigid_motions import exp, log
 from gavo_jax.status import AlignmentStatus, bit
@@ -49,16 +49,10 @@ MAX_DISSENT_RATIO = 2.0
 MIN_REPLACEMENT_RATIO = 1.2
 """Ratio of a motion's dissent to that from its replacement, from which on the replacement is taken."""
 MISTRUSTED, MISTRUSTED_STRICTLY = 18.0, 12.0
-"""Dissents above which a motion may be a body's; the second one applies beside bodies and to motions that jump. With
-pure noise the median block gains 5.3, the median of chi-squared with six degrees of freedom. Real clips have about 9 in
-the median pair and 17 in the worst.
+"""Dissents above which a motion may be a body's; the second one applies beside bodies, and where the velocity changes
+abruptly. With pure noise the median block gains 5.3, the median of chi-squared with six degrees of freedom. Real clips
+have about 9 in the median pair and 17 in the worst.
 """
-JUMP = 0.5
-"""Change of the translation, over the largest that is plausible, above which a motion jumps: as it does where the
-search leaves a body for the scene.
-"""
-JUMP_TOLERANCE = 0.004
-"""Errors of two motions, metres."""
 GAIN = 0.01
 """Gain in support that a round needs for another one to follow."""
 LARGE = 0.25
@@ -218,7 +212,7 @@ class BodyAware:
         """Complete an attempt with its bodies and the state after it; nothing is learnt from a motion in doubt."""
         scene, segmenter = state.scene, self.segmenter
         dissent = 0.0 if look.opinion is None else float(look.opinion.dissent)
-        if dissent > (MISTRUSTED_STRICTLY if self._jumps(state, clock, attempt) else MISTRUSTED):
+        if dissent > (MISTRUSTED_STRICTLY if self._is_abrupt(state, clock, attempt) else MISTRUSTED):
             attempt = mistrusted(attempt)
         limit = MISTRUSTED_STRICTLY if np.any(found) else MISTRUSTED
         is_doubted = dissent > limit or AlignmentStatus.MOVING_BODY in attempt.result.statuses
@@ -266,13 +260,11 @@ class BodyAware:
             attempt, look = again, other
         return attempt, look
 
-    def _jumps(self, state: AwareState, clock: Clock, attempt: Attempt) -> bool:
-        """Whether the camera's velocity seems to change faster than a hand changes it."""
-        if not is_motion_known(state.tracker):
-            return False
-        change = inverse(np.asarray(attempt.result.target_T_reference)) @ self.predict(state, float(clock.elapsed))
-        possible = possible_change(float(clock.elapsed), float(state.tracker.seconds))[0]
-        return bool(np.linalg.norm(change[:3, 3]) > JUMP * possible + JUMP_TOLERANCE)
+    def _is_abrupt(self, state: AwareState, clock: Clock, attempt: Attempt) -> bool:
+        """Whether the velocity changes abruptly, as where a search leaves a body for the scene."""
+        elapsed, found = float(clock.elapsed), np.asarray(attempt.result.target_T_reference)
+        lasted = float(state.tracker.seconds)
+        return is_motion_known(state.tracker) and is_abrupt(found, self.predict(state, elapsed), elapsed, lasted)
 
     def _look(self, state: AwareState, clock: Clock, attempt: Attempt) -> FrameView:
         return self.segmenter.look(state.scene, attempt.state, attempt.result.target_T_reference, float(clock.elapsed))

@@ -124,7 +124,7 @@ class WithRival:
         if other is not None and other.usable:
             aged = rival._replace(age=rival.age.later(elapsed))
             if attempt.usable:
-                return self._reopened(self._decide(attempt, other, aged, open_for), open_for, frame)
+                return self._begun_anew(self._decide(attempt, other, aged, open_for), open_for, frame)
             depth_is_doubted = AlignmentStatus.DEPTH_MISMATCH in attempt.result.statuses
             if other.deviation < EXACT and not depth_is_doubted:  # that motion is lost; whose it was stays open
                 return self._taken(other, aged, open_for, open_for, clearly=True)
@@ -132,16 +132,20 @@ class WithRival:
             rival = self._nobody
         elif other is not None:
             rival = self._rival_of(attempt.state) if float(open_for.seconds) < DROPPED_AFTER else self._nobody
-        return self._reopened(attempt._replace(state=RivalledState(attempt.state, rival, open_for)), open_for, frame)
+        return self._begun_anew(attempt._replace(state=RivalledState(attempt.state, rival, open_for)), open_for, frame)
 
-    def _reopened(self, attempt: Attempt, open_for: Span, frame: Frame) -> Attempt:
-        """Start anew where a motion may be a body's while the question is open: all since then is unknown."""
-        if attempt.revises or not open_for.lasts or AlignmentStatus.MOVING_BODY not in attempt.result.statuses:
+    def _begun_anew(self, attempt: Attempt, open_for: Span, frame: Frame) -> Attempt:
+        """The attempt, with a new beginning where it may follow a body and it is open whether the ones before did.
+
+        All these motions are unknown then. What was learnt with them is kept only if bodies were told from the scene.
+        """
+        is_doubted = attempt.usable and AlignmentStatus.MOVING_BODY in attempt.result.statuses
+        if attempt.revises or not (is_doubted and open_for.lasts):
             return attempt
         earlier = max(int(open_for.frames) - 1, 0)
-        known = np.any(np.asarray(attempt.state.first.scene.suspected) > SUSPECTED)
-        after = attempt.state._replace(open_for=BEGUN) if known else self.start(frame)
-        return attempt._replace(unknown=earlier + 1, revises=earlier, state=after)
+        knows_bodies = np.any(np.asarray(attempt.state.first.scene.suspected) > SUSPECTED)
+        state = attempt.state._replace(open_for=BEGUN) if knows_bodies else self.start(frame)
+        return attempt._replace(unknown=earlier + 1, revises=earlier, state=state)
 
     def _called(self, state: RivalledState, attempt: Attempt) -> tuple[Rival, Span]:
         """The rival, and how long the first motion has been in question.

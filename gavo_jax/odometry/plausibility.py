@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Float64
 
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.objective.estimates import ExplainedShare
 from gavo_jax.se3 import log
 from gavo_jax.status import AlignmentStatus, as_findings, gravest
+from gavo_jax.trajectory import inverse
 
 REMEMBERED = 15
 """Number of pairs whose median is the usual value."""
@@ -24,6 +25,8 @@ MAX_ACCELERATION = (15.0, 28.0)
 """m/s² and rad/s². Over two frames of a hand-held camera the ground truth of the TUM clips reaches 3 and 21
 (`benchmarks/acceleration.py`); a braking car reaches 10.
 """
+ABRUPT, ABRUPT_TOLERANCE = 0.5, 0.004
+"""Share of the possible change of the translation, plus errors in metres, above which a change is abrupt."""
 MAX_SPEED = (5.0, 12.0)
 """m/s and rad/s: images of a faster camera are blurred."""
 STAMP_JITTER = 0.02
@@ -135,6 +138,14 @@ def depth_alone_disagrees(explained: ExplainedShare) -> Bool[Array, ""]:
 def possible_change(elapsed: Any, last_elapsed: Any) -> Any:
     """How far a camera's translation and rotation can be from the prediction, metres and radians."""
     return np.array(MAX_ACCELERATION, np.float32) * elapsed * 0.5 * (elapsed + last_elapsed)
+
+
+def is_abrupt(
+    motion: Float64[np.ndarray, "4 4"], predicted: Float64[np.ndarray, "4 4"], elapsed: float, last_elapsed: float
+) -> bool:
+    """Whether a motion's translation is further from the prediction than a hand accelerates a camera."""
+    change = float(np.linalg.norm((inverse(motion) @ predicted)[:3, 3]))
+    return change > ABRUPT * float(possible_change(elapsed, last_elapsed)[0]) + ABRUPT_TOLERANCE
 
 
 def image_shift(translation: Any, rotation: Any) -> Any:
