@@ -124,7 +124,7 @@ class WithRival:
         if other is not None and other.usable:
             aged = rival._replace(age=rival.age.later(elapsed))
             if attempt.usable:
-                return self._begun_anew(self._decide(attempt, other, aged, open_for), open_for, frame)
+                return self._decide(attempt, other, aged, open_for, frame)
             depth_is_doubted = AlignmentStatus.DEPTH_MISMATCH in attempt.result.statuses
             if other.deviation < EXACT and not depth_is_doubted:  # that motion is lost; whose it was stays open
                 return self._taken(other, aged, open_for, open_for, clearly=True)
@@ -140,12 +140,14 @@ class WithRival:
         All these motions are unknown then. What was learnt with them is kept only if bodies were told from the scene.
         """
         is_doubted = attempt.usable and AlignmentStatus.MOVING_BODY in attempt.result.statuses
-        if attempt.revises or not (is_doubted and open_for.lasts):
+        if not (is_doubted and open_for.lasts):
             return attempt
         earlier = max(int(open_for.frames) - 1, 0)
-        knows_bodies = np.any(np.asarray(attempt.state.first.scene.suspected) > SUSPECTED)
-        state = attempt.state._replace(open_for=BEGUN) if knows_bodies else self.start(frame)
-        return attempt._replace(unknown=earlier + 1, revises=earlier, state=state)
+        state: RivalledState = attempt.state
+        tells = state.rival.is_there and state.rival.stands_before
+        tells = tells or np.any(np.asarray(state.first.scene.suspected) > SUSPECTED)
+        after = state._replace(open_for=BEGUN) if tells else self.start(frame)
+        return attempt._replace(unknown=earlier + 1, revises=earlier, state=after)
 
     def _called(self, state: RivalledState, attempt: Attempt) -> tuple[Rival, Span]:
         """The rival, and how long the first motion has been in question.
@@ -159,7 +161,7 @@ class WithRival:
         rival = self._rival_of(state.first, standing_before=not is_doubted)
         return rival, BEGUN if rival.is_there and not open_for.lasts else open_for
 
-    def _decide(self, attempt: Attempt, other: Attempt, rival: Rival, open_for: Span) -> Attempt:
+    def _decide(self, attempt: Attempt, other: Attempt, rival: Rival, open_for: Span, frame: Frame) -> Attempt:
         """Decide which of two attempts stands for a frame, and whether the rival, of its age then, is kept."""
         duel = self._duel(attempt, other, rival)
         open_after = OVER if rival.stands_before else open_for
@@ -168,11 +170,13 @@ class WithRival:
         if duel.casts_doubt:
             attempt = mistrusted(attempt)
         if duel.is_rival_unsupported:
-            return attempt._replace(state=self._alone(attempt.state, open_after))
-        if duel.is_given_up:
-            return attempt._replace(state=self._alone(attempt.state, open_for))
-        kept = rival._replace(state=other.state, motions=duel.motions.stored(), ahead=np.int32(duel.ahead))
-        return attempt._replace(state=RivalledState(attempt.state, kept, open_for))
+            state = self._alone(attempt.state, open_after)
+        elif duel.is_given_up:
+            state = self._alone(attempt.state, open_for)
+        else:
+            kept = rival._replace(state=other.state, motions=duel.motions.stored(), ahead=np.int32(duel.ahead))
+            state = RivalledState(attempt.state, kept, open_for)
+        return self._begun_anew(attempt._replace(state=state), open_for, frame)
 
     def _duel(self, attempt: Attempt, other: Attempt, rival: Rival) -> Duel:
         """Compare the two motions; the anchor's pixels vote only where the choice matters."""
