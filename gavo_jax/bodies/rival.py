@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64
 from gavo_jax.alignment.judgement import UNKNOWN
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.bodies.aligner import SUSPECTED, BodyAware, mistrusted
-from gavo_jax.bodies.duel import BEGUN, DROPPED_AFTER, EXACT, OVER, Duel, Motions, Span, leads
+from gavo_jax.bodies.duel import AGREED_AFTER, BEGUN, DROPPED_AFTER, EXACT, OVER, Duel, Motions, Span, leads
 from gavo_jax.bodies.identity import BodyTracks
 from gavo_jax.bodies.pixel_evidence import View, inverse_depth_of
 from gavo_jax.bodies.scene import AwareState
@@ -206,8 +206,9 @@ class WithRival:
         result = _returned(other.result, onward @ inverse(first_T_anchor))
         taken = other._replace(state=self._alone(other.state, open_after), result=result)
         earlier = int(rival.age.frames) - 1
-        parted = rival.motions.have_parted(clearly=clearly)
-        if parted or earlier == 0:  # else both agreed on the earlier motions
+        have_parted = rival.motions.have_parted(clearly=clearly)
+        is_brief = open_for.lasts and not clearly and float(rival.age.seconds) < AGREED_AFTER
+        if have_parted or is_brief or earlier == 0:  # else both agreed on the earlier motions
             unknown = max(int(open_for.frames) - earlier - 1, 0)
             taken = taken._replace(unknown=unknown, revises=unknown + earlier)
         return mistrusted(taken)
