@@ -26,7 +26,7 @@ from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.odometry.aligners import Attempt, Search
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.stream import track
-from gavo_jax.odometry.tracking import blank_state
+from gavo_jax.odometry.tracking import Clock, blank_state
 from gavo_jax.presets import preset
 from gavo_jax.settings import Settings
 from gavo_jax.status import AlignmentStatus
@@ -236,6 +236,37 @@ def test_the_last_motion_does_not_stand_in_for_frames_that_were_lost(
     clock: Any = SimpleNamespace(elapsed=(lost + 1) / 30)
     attempt, _ = BodyAware(nothing, nothing)._asked(state, nothing, clock, missing)
     assert attempt is (guess if is_guessed else missing)
+
+
+@pytest.mark.parametrize(
+    ("metres", "dissent", "status"),
+    [
+        (0.02, 14.0, AlignmentStatus.MOVING_BODY),
+        (0.02, 10.0, AlignmentStatus.OK),
+        (0.0, 14.0, AlignmentStatus.OK),
+        (0.0, 20.0, AlignmentStatus.MOVING_BODY),
+    ],
+)
+def test_an_abrupt_motion_that_much_of_the_area_dissents_from_may_be_a_bodys(
+    monkeypatch: pytest.MonkeyPatch, metres: float, dissent: float, status: AlignmentStatus
+) -> None:
+    """A card left the view, and the search the card for the room: 2 cm from one frame to the next, all `ok`."""
+    look = MotionSegmenter.look
+
+    def with_dissent(self: MotionSegmenter, *arguments: Any) -> Any:
+        seen = look(self, *arguments)
+        return seen._replace(opinion=seen.opinion._replace(dissent=jnp.float32(dissent), least=jnp.float32(dissent)))
+
+    monkeypatch.setattr(MotionSegmenter, "look", with_dissent)
+    search, frames = Search(CAMERA, TRACKED, jax.random.key(0)), SyntheticSequence(3, camera=CAMERA)
+    aware = BodyAware(search, search)
+    clocks = [Clock(np.float32(1 / 30), np.float32(0), np.uint32(index)) for index in range(3)]
+    state = aware.align(aware.start(frames[0]), frames[1], clocks[1]).state
+    onward = aware.predict(state, 1 / 30)
+    onward[0, 3] += metres
+    monkeypatch.setattr(BodyAware, "predict", lambda *_: onward)
+    result = aware.align(state, frames[2], clocks[2]).result
+    assert result.status is status
 
 
 def test_points_that_are_left_out_are_not_asked_for() -> None:

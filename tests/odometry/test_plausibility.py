@@ -17,11 +17,12 @@ from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequen
 from gavo_jax.objective.estimates import ExplainedShare
 from gavo_jax.odometry.aligners import Attempt
 from gavo_jax.odometry.driver import MAX_DOUBTED, MAX_HELD, Odometry, Step
-from gavo_jax.odometry.plausibility import MIN_REMEMBERED, STAMP_JITTER, Usual, _change, judge_by_history
+from gavo_jax.odometry.plausibility import MIN_REMEMBERED, STAMP_JITTER, Usual, _change, is_abrupt, judge_by_history
 from gavo_jax.odometry.run import trajectory_of
 from gavo_jax.odometry.second_thoughts import DoubtingDepth
 from gavo_jax.odometry.stream import track
 from gavo_jax.presets import preset
+from gavo_jax.rigid_motions import exp
 from gavo_jax.settings import OdometryOptions, Settings
 from gavo_jax.solvers.gauss_newton import GaussNewton
 from gavo_jax.status import AlignmentStatus as Status
@@ -95,6 +96,20 @@ def test_no_stamp_turns_a_motion_round(rate: int) -> None:
     expected = jnp.array([2.0, 0.0, 0.0, 0.0, 3.0, 0.0]) / rate
     change = _change(-0.9 * expected, expected, jnp.float32(STAMP_JITTER * rate))
     assert np.all(np.asarray(change) >= 0.9 * np.array([2.0, 3.0]) / rate - 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("metres", "radians", "seconds", "abrupt"),
+    [(0.014, 0.0, 1 / 30, True), (0.010, 0.0, 1 / 30, False), (0.0, 0.1, 1 / 30, False), (0.014, 0.0, 1 / 10, False)],
+)
+def test_an_abrupt_change_is_one_of_the_translation(
+    metres: float, radians: float, seconds: float, abrupt: bool
+) -> None:
+    """A hand turns a camera abruptly, but does not push it so."""
+    predicted = exp(np.array([0.02, 0.0, 0.01, 0.0, 0.02, 0.0]))
+    motion = predicted @ exp(np.array([0.0, metres, 0.0, radians, 0.0, 0.0]))
+    assert is_abrupt(motion, predicted, seconds, seconds) == abrupt
+    assert is_abrupt(predicted, motion, seconds, seconds) == abrupt
 
 
 def test_nothing_is_unusual_before_anything_is_known() -> None:
