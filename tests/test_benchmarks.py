@@ -426,12 +426,12 @@ def test_moving_bodies_are_scored(load, quick, tmp_path: Path, capsys: pytest.Ca
     assert "below every peer" in capsys.readouterr().out
     with pytest.raises(GavoError, match="2"):
         moving.main(clips=CLIP, shares="2")
-    case = next(moving.cases(CLIP, "0.2", "", 1, 20))
+    case = next(moving.cases(CLIP, "0.2", "", range(1), 20))
     told, seen, where = moving.Told(case.sequence)[5], case.sequence[5], case.sequence.part_labels(5) > 0
     assert seen.depth[where].any() and not told.depth[where].any()
     assert np.mean(told.depth != seen.depth) < 2 * where.mean()
     assert moving.with_bodies(NEWTON, "told").odometry.bodies == "off"
-    assert [case.body for case in moving.cases("", "0.1", "1,2", 2, 3)] == ["1 moving", "2 moving"] * 2
+    assert [case.body for case in moving.cases("", "0.1", "1,2", range(2), 3)] == ["1 moving", "2 moving"] * 2
 
 
 def test_a_card_is_where_its_truth_says(load) -> None:

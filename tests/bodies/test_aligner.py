@@ -254,7 +254,7 @@ def test_an_abrupt_motion_that_much_of_the_area_dissents_from_may_be_a_bodys(
     look = MotionSegmenter.look
 
     def with_dissent(self: MotionSegmenter, *arguments: Any) -> Any:
-        seen = look(self, *arguments)
+        seen: Any = look(self, *arguments)
         return seen._replace(opinion=seen.opinion._replace(dissent=jnp.float32(dissent), least=jnp.float32(dissent)))
 
     monkeypatch.setattr(MotionSegmenter, "look", with_dissent)
