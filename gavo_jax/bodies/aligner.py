@@ -212,7 +212,7 @@ class BodyAware:
         """Complete an attempt with its bodies and the state after it; nothing is learnt from a motion in doubt."""
         scene, segmenter = state.scene, self.segmenter
         dissent = 0.0 if look.opinion is None else float(look.opinion.dissent)
-        if dissent > (MISTRUSTED_STRICTLY if self._is_abrupt(state, clock, attempt) else MISTRUSTED):
+        if dissent > MISTRUSTED or (dissent > MISTRUSTED_STRICTLY and self._is_abrupt(state, clock, attempt)):
             attempt = mistrusted(attempt)
         limit = MISTRUSTED_STRICTLY if np.any(found) else MISTRUSTED
         is_doubted = dissent > limit or AlignmentStatus.MOVING_BODY in attempt.result.statuses

@@ -142,7 +142,7 @@ class WithRival:
         is_doubted = attempt.usable and AlignmentStatus.MOVING_BODY in attempt.result.statuses
         if not (is_doubted and open_for.lasts):
             return attempt
-        earlier = max(int(open_for.frames) - 1, 0)
+        earlier = int(open_for.frames) - 1
         state: RivalledState = attempt.state
         tells = state.rival.is_there and state.rival.stands_before
         tells = tells or np.any(np.asarray(state.first.scene.suspected) > SUSPECTED)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Float64
 
 from gavo_jax.alignment.result import Alignment
 from gavo_jax.objective.estimates import ExplainedShare
+from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.se3 import log
 from gavo_jax.status import AlignmentStatus, as_findings, gravest
 from gavo_jax.trajectory import inverse
@@ -144,8 +145,8 @@ def is_abrupt(
     motion: Float64[np.ndarray, "4 4"], predicted: Float64[np.ndarray, "4 4"], elapsed: float, last_elapsed: float
 ) -> bool:
     """Whether a motion's translation is further from the prediction than a hand accelerates a camera."""
-    change = float(np.linalg.norm((inverse(motion) @ predicted)[:3, 3]))
-    return change > ABRUPT * float(possible_change(elapsed, last_elapsed)[0]) + ABRUPT_TOLERANCE
+    change, _ = length_and_angle(inverse(motion) @ predicted)
+    return bool(change > ABRUPT * possible_change(elapsed, last_elapsed)[0] + ABRUPT_TOLERANCE)
 
 
 def image_shift(translation: Any, rotation: Any) -> Any:

@@ -76,15 +76,17 @@ def error_mm(sequence: Any, steps: list[Step]) -> float:
     return 1e3 * float(np.linalg.norm(between[:3, 3]))
 
 
+def registered(sequence: Any, indices: range) -> list[Step]:
+    odometry = Odometry(sequence.camera, FAST)
+    steps = [odometry.register(sequence[index], float(sequence.timestamps[index])) for index in indices]
+    return [step for step in steps if step is not None]
+
+
 @pytest.mark.parametrize(("share", "seed"), [(0.25, 2), (0.33, 5)])
 def test_a_card_does_not_take_the_camera_along(data_dir: Path, share: float, seed: int, clips: ModuleType) -> None:
     """A step to the side and a turn explained card and room to the eye; from then on the pose was 5 to 8 cm off."""
     sequence = clips.CardClip(TumSequence(data_dir / "fr1_xyz")[:60], share, seed, clips.LOOKS[0])
-    odometry = Odometry(sequence.camera, FAST)
-    steps = []
-    for index in range(9):
-        step = odometry.register(sequence[index], float(sequence.timestamps[index]))
-        steps += [step] if step is not None else []
+    steps = registered(sequence, range(9))
     assert error_mm(sequence, steps) < 15.0
     jumps = [step.alignment for step in steps if step.alignment.covariance[0, 0] > 0.1]
     assert len(jumps) == 1 and AlignmentStatus.MOVING_BODY in jumps[0].statuses  # the pose is mended, and that is told
@@ -96,9 +98,7 @@ def test_what_a_card_led_that_filled_the_image_is_told_once_it_leaves(
 ) -> None:
     """Eleven pairs were off by more than 2 cm, and all were ok; the track went on from the card to the room."""
     sequence = clips.CardClip(TumSequence(data_dir / "fr1_rpy")[:60], 0.4, seed, clips.LOOKS[0])
-    odometry = Odometry(sequence.camera, FAST)
-    registered = [odometry.register(sequence[index], float(sequence.timestamps[index])) for index in range(28)]
-    steps = revised([step for step in registered if step is not None])
+    steps = revised(registered(sequence, range(28)))
     covered = [np.mean(sequence.part_labels(step.index)) > 0.8 for step in steps]
     assert sum(covered) > 8
     told = [AlignmentStatus.MOVING_BODY in step.alignment.statuses for step in steps]
@@ -109,11 +109,10 @@ def test_what_a_card_led_that_filled_the_image_is_told_once_it_leaves(
 def test_a_plain_body_that_comes_in_is_not_taken_for_wrong_depth(data_dir: Path, clips: ModuleType) -> None:
     """It was, and as no such frame became the reference, the body was never found."""
     sequence = clips.CardClip(TumSequence(data_dir / "fr1_rpy")[:60], 0.1, 2, clips.LOOKS[2])
-    odometry = Odometry(sequence.camera, FAST)
-    steps = [odometry.register(sequence[index], float(sequence.timestamps[index])) for index in range(36, 60)]
-    assert {step.alignment.status for step in steps if step is not None} == {AlignmentStatus.OK}
+    steps = registered(sequence, range(36, 60))
+    assert {step.alignment.status for step in steps} == {AlignmentStatus.OK}
     last = steps[-1]
-    assert last is not None and len(last.bodies) == 1
+    assert len(last.bodies) == 1
     covered = sequence.part_labels(59) > 0
     assert np.sum(last.bodies[0].mask & covered) > 0.8 * np.sum(last.bodies[0].mask | covered)
 
@@ -199,13 +198,23 @@ def rivalled(
     return aligner, SyntheticSequence(frames=1, camera=CAMERA)[0]
 
 
+def flag_first(aligner: WithRival, finding: AlignmentStatus) -> None:
+    """Give every result of an aligner's first search a finding."""
+    object.__setattr__(aligner, "first", Flagged(aligner.first, finding))
+
+
+def covered_by_a_wall(frame: Frame) -> Frame:
+    """A frame in which nothing stands before anything else."""
+    return replace(frame, depth=np.full_like(frame.depth, 5000))
+
+
 CLOCK = Clock(np.float32(1 / 30), np.float32(0), np.uint32(1))
 
 
 def test_what_a_body_that_fills_the_image_led_is_unknown_once_it_is_seen() -> None:
     """Nothing stands before anything else in the first frames, so that there is no rival to tell."""
     aligner, frame = rivalled([(True, 0.05, 1e-3)] * 7, [(True, 0.0, 1e-3)])
-    covered = replace(frame, depth=np.full_like(frame.depth, 5000))
+    covered = covered_by_a_wall(frame)
     state, seen = aligner.start(covered), aligner.start(frame)
     assert not state.rival.is_there and seen.rival.is_there
     for _ in range(6):
@@ -245,8 +254,8 @@ def test_as_long_as_that_is_open_a_motion_that_may_be_a_bodys_puts_all_before_in
 ) -> None:
     """A card that fills the image leaves it: the search hands itself over to the room, over some frames."""
     aligner, frame = rivalled([(usable, 0.0, 1e-3)], [])
-    covered = replace(frame, depth=np.full_like(frame.depth, 5000))
-    object.__setattr__(aligner, "first", Flagged(aligner.first, AlignmentStatus.MOVING_BODY))
+    covered = covered_by_a_wall(frame)
+    flag_first(aligner, AlignmentStatus.MOVING_BODY)
     state = aligner.start(covered)._replace(open_for=open_for)
     attempt = aligner.align(state, covered, CLOCK)
     assert attempt.unknown == unknown and attempt.revises == max(unknown - 1, 0)
@@ -257,8 +266,8 @@ def test_as_long_as_that_is_open_a_motion_that_may_be_a_bodys_puts_all_before_in
 def test_what_was_learnt_before_such_a_motion_is_kept_where_it_tells_bodies(suspected: float) -> None:
     """A card that filled the image was known to be at rest; the room that it uncovered was then taken for a body."""
     aligner, frame = rivalled([(True, 0.0, 1e-3)], [])
-    covered = replace(frame, depth=np.full_like(frame.depth, 5000))
-    object.__setattr__(aligner, "first", Flagged(aligner.first, AlignmentStatus.MOVING_BODY))
+    covered = covered_by_a_wall(frame)
+    flag_first(aligner, AlignmentStatus.MOVING_BODY)
     state = aligner.start(covered)
     everywhere = np.ones_like(np.asarray(state.first.scene.known))
     scene = state.first.scene._replace(known=-everywhere, suspected=suspected * everywhere)
@@ -269,7 +278,7 @@ def test_what_was_learnt_before_such_a_motion_is_kept_where_it_tells_bodies(susp
 
 def test_a_rival_that_tells_what_stands_before_the_rest_is_kept_at_such_a_motion() -> None:
     aligner, frame = rivalled([(True, 0.0, 1e-3)], [(True, 0.01, 1e-3)])
-    object.__setattr__(aligner, "first", Flagged(aligner.first, AlignmentStatus.MOVING_BODY))
+    flag_first(aligner, AlignmentStatus.MOVING_BODY)
     state = aligner.start(frame)
     attempt = aligner.align(state, frame, CLOCK)
     assert attempt.unknown == 1 and attempt.state.rival.is_there
@@ -334,7 +343,7 @@ def test_where_both_moved_alike_a_rival_that_goes_on_makes_no_guesses_of_the_mot
 def test_where_depth_is_in_doubt_the_rival_does_not_take_over() -> None:
     """Wrong depth ends the first motion, and looks like a body to the rival; it is looked at without depth first."""
     aligner, frame = rivalled([(True, 0.0, 1e-3), (False, 0.0, 1.0)], [(True, 0.01, 1e-3)] * 2)
-    object.__setattr__(aligner, "first", Flagged(aligner.first, AlignmentStatus.DEPTH_MISMATCH))
+    flag_first(aligner, AlignmentStatus.DEPTH_MISMATCH)
     both = aligner.align(aligner.start(frame), frame, CLOCK)
     assert not aligner.align(both.state, frame, CLOCK).usable
 
