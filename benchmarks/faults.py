@@ -154,6 +154,20 @@ def shifted_stamp(seconds: float) -> Fault:
     return damage
 
 
+def delayed(seconds: float) -> Fault:
+    """Stamp a frame `seconds` late, and those that it holds up 2 ms apart, as a driver does that stamps on arrival."""
+
+    def damage(clip: FrameSequence, places: list[int]) -> Damaged:
+        sequence = Damaged(clip, list(range(len(clip))))
+        sequence.timestamps[places] += seconds
+        for i in range(1, len(clip)):
+            sequence.timestamps[i] = max(sequence.timestamps[i], sequence.timestamps[i - 1] + 0.002)
+        sequence.damaged = set(np.flatnonzero(sequence.timestamps != sequence.moments).tolist())
+        return sequence
+
+    return damage
+
+
 def stale(age: int) -> Fault:
     """Replace a frame's images by those of `age` frames before."""
 
@@ -286,6 +300,10 @@ FAULTS: dict[str, Fault] = {
     "dropped frames": dropped(DROPPED),
     "stamp out of order": shifted_stamp(-0.01),
     "equal stamps": shifted_stamp(0.0),
+    "stamp too late": shifted_stamp(0.1),
+    "stamp too early": shifted_stamp(0.005),
+    "late by 60 ms": delayed(0.06),
+    "late by 90 ms": delayed(0.09),
     "stale by 10": stale(10),
     "stale by 6": stale(6),
     "swapped": swapped(1),
@@ -395,7 +413,7 @@ def measure(
         alone = [i for i in range(len(sequence)) if i not in sequence.damaged]
         moments = dict(zip(sequence.timestamps, sequence.moments, strict=True))
         trajectory = replace(trajectory, timestamps=np.array([moments[stamp] for stamp in trajectory.timestamps]))
-        drifts.append(drift(trajectory, sequence.moments[alone], truth))
+        drifts.append(known_drift(trajectory, sequence.moments[alone], truth) or np.nan)
         clean_drifts.append(drift(reference, clip.timestamps[np.array(sequence.sources)[alone]], truth))
     medians = float(np.median(drifts)), float(np.median(clean_drifts))
     return Row(

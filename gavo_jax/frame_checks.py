@@ -113,6 +113,9 @@ MAX_INTERVAL_RATIO = 2.5
 """An interval longer than this many usual ones is a gap. Recordings often lack a single frame."""
 MAX_USUAL_INTERVAL = 1.5
 """Ratio of an interval to the usual one above which it may span two frames."""
+MIN_INTERVAL_RATIO, MIN_INTERVAL = 0.4, 1e-3
+"""Ratio of an interval to the usual one, and seconds, below which it can't be right: a camera that changes from 15 to
+30 images per second halves it."""
 MIN_INTERVALS = 3
 """Number of known intervals before one can be unusual."""
 LONGEST_INTERVAL = 1e3
@@ -176,10 +179,10 @@ def check_frame(
     return finding, history
 
 
-def doubts_last_stamp(timestamp: float, history: History) -> bool:
-    """Whether a stamp that is too early casts doubt on the last one, which came later than usual.
+def seconds_late(timestamp: float, history: History) -> float:
+    """Seconds by which the last stamp was too late, if a stamp that is too early casts doubt on it, or 0.
 
-    Two frames with exchanged stamps look like this.
+    A frame that was stamped late, and two frames with exchanged stamps, look like this.
 
     Args:
         timestamp: Stamp of the new frame, seconds.
@@ -187,7 +190,14 @@ def doubts_last_stamp(timestamp: float, history: History) -> bool:
     """
     *before, last = (0.0, 0.0) if len(history.intervals) <= MIN_INTERVALS else history.intervals
     early = history.timestamp is not None and history.timestamp - last < timestamp < history.timestamp
-    return early and last > MAX_USUAL_INTERVAL * median(before)
+    usual = median(before)
+    return last - usual if early and last > MAX_USUAL_INTERVAL * usual else 0.0
+
+
+def credible_time(elapsed: float, history: History) -> float:
+    """The time between two frames in seconds, or the usual one if a camera of this rate can't be that fast."""
+    usual = median(history.intervals) if len(history.intervals) > MIN_INTERVALS else MIN_INTERVAL
+    return elapsed if elapsed >= MIN_INTERVAL_RATIO * usual else max(usual, MIN_INTERVAL)
 
 
 def doubt_unit_of_time(index: int, history: History) -> None:

@@ -12,7 +12,7 @@ from gavo_jax.datasets.base import Frame, FrameError, TimestampError
 from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.datasets.rendered.sensor_noise import NONE
 from gavo_jax.datasets.rendered.synthetic import DEFAULT_CAMERA, SyntheticSequence
-from gavo_jax.frame_checks import MAX_DOUBTS, Finding, History, Use, check_frame, doubts_last_stamp
+from gavo_jax.frame_checks import MAX_DOUBTS, Finding, History, Use, check_frame, credible_time, seconds_late
 from gavo_jax.status import AlignmentStatus as Status
 
 CAMERA = DEFAULT_CAMERA.level(1)
@@ -216,19 +216,28 @@ def test_no_false_alarms_on_real_clips(data_dir, clip):
 
 
 @pytest.mark.parametrize(
-    ("last", "new", "doubted"),
+    ("last", "new", "late"),
     [
-        (2.0, -1.0, True),  # two frames that changed their stamps
-        (1.0, -0.3, False),  # the last one came when it should
-        (2.0, 1.0, False),  # in order
-        (2.0, -2.5, False),  # older than both
-        (2.0, float("nan"), False),
+        (2.0, -1.0, 1.0),  # two frames that changed their stamps
+        (3.0, -1.0, 2.0),
+        (1.0, -0.3, 0.0),  # the last one came when it should
+        (2.0, 1.0, 0.0),  # in order
+        (2.0, -2.5, 0.0),  # older than both
+        (2.0, float("nan"), 0.0),
     ],
 )
-def test_a_stamp_out_of_order_tells_of_the_one_before_that_came_late(last: float, new: float, doubted: bool) -> None:
+def test_a_stamp_out_of_order_tells_of_the_one_before_that_came_late(last: float, new: float, late: float) -> None:
     history = History(timestamp=100.0, intervals=(1.0, 1.1, 0.9, 1.0, last))
-    assert doubts_last_stamp(100.0 + new, history) == doubted
-    assert not doubts_last_stamp(100.0 + new, history._replace(intervals=(1.0, last))), "nothing is usual yet"
+    assert seconds_late(100.0 + new, history) == pytest.approx(late)
+    assert not seconds_late(100.0 + new, history._replace(intervals=(1.0, last))), "nothing is usual yet"
+
+
+def test_a_time_that_no_camera_of_this_rate_needs_is_replaced_by_the_usual_one() -> None:
+    """A rate that doubles is real; a stamp that nearly repeats the last one is not."""
+    usual = History(intervals=(0.1, 0.03, 0.03, 0.03, 0.002))
+    assert [credible_time(seconds, usual) for seconds in (0.002, 0.015, 0.03, 0.5)] == [0.03, 0.015, 0.03, 0.5]
+    assert credible_time(0.002, History(intervals=(0.03, 0.03))) == 0.002, "nothing is usual yet"
+    assert credible_time(1e-9, History()) == 1e-3
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 16), (16, 1), (2, 2), (50, 3)])

@@ -23,6 +23,10 @@ from gavo_jax.rigid_motions import log, transport_covariance
 from gavo_jax.status import BY_GRAVITY, AlignmentStatus
 from gavo_jax.trajectory import inverse, stamp_name
 
+SHORTEST = 0.01
+"""Seconds between two frames below which nothing is said of the velocity: timestamps may be wrong, and where they are
+right the readout is as short.
+"""
 STEP_FLOOR = 5e-4
 """Standard deviation, metres and radians, of a step's error beyond what its covariance says."""
 DOUBTED = 0.1
@@ -340,14 +344,14 @@ def _covariance(step: Step) -> Float64[np.ndarray, "6 6"]:
 def _own_velocity(step: Step) -> Float64[np.ndarray, " 6"]:
     """Motion of the points in the camera at a step's moment, m/s and rad/s.
 
-    This is the mean since its reference, corrected by the sway that the rolling shutter reveals; 0 where the timestamps
-    tell no time, or the motion took another time or is unknown.
+    This is the mean since its reference, corrected by the sway that the rolling shutter reveals; 0 where no camera is
+    as fast as the timestamps say, or the motion took another time or is unknown.
     """
     seconds, result = step.timestamp - step.reference_timestamp, step.alignment
-    if seconds <= 0 or AlignmentStatus.IMPLAUSIBLE_MOTION in result.statuses or is_unknown(result):
+    if seconds < SHORTEST or AlignmentStatus.IMPLAUSIBLE_MOTION in result.statuses or is_unknown(result):
         return np.zeros(6)
     motion, sway = (np.asarray(of, np.float64) for of in (result.target_T_reference, result.sway))
-    return (log(motion) + sway) / max(seconds, 1e-3)
+    return (log(motion) + sway) / seconds
 
 
 def mirrored(covariance: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6"]:

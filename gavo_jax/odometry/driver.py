@@ -21,7 +21,7 @@ from gavo_jax.compilation.waits import Stopwatch
 from gavo_jax.datasets.base import Frame, FrameError, as_seconds, require_begin_in_seconds, require_grey_levels
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoWarning
-from gavo_jax.frame_checks import Finding, Use, doubt_unit_of_time, doubts_last_stamp
+from gavo_jax.frame_checks import Finding, Use, doubt_unit_of_time, seconds_late
 from gavo_jax.odometry.aligners import Aligner, Attempt
 from gavo_jax.odometry.beginnings import begun, followed, revised_by
 from gavo_jax.odometry.composition import make_aligner, warm_up_wholly
@@ -287,9 +287,9 @@ class Odometry:
 
     def _pass_over(self, before: Progress, finding: Finding, timestamp: float) -> FrameOutcome:
         """Pass over an unusable frame."""
-        revises = int(before.held == 0 and doubts_last_stamp(timestamp, before.history))
-        after = self._lose(before, None, timestamp)
-        return FrameOutcome(after, no_alignment(finding.status), lost=True, revises=revises)
+        late = seconds_late(timestamp, before.history) if before.held == 0 else 0.0
+        after = self._lose(before, None, timestamp)._replace(reference_late=late or before.reference_late)
+        return FrameOutcome(after, no_alignment(finding.status), lost=True, revises=int(late > 0))
 
     def _begin(self, before: Progress, frame: Frame | None, finding: Finding) -> FrameOutcome:
         """Begin with a frame where there is no reference yet; it becomes the first one if it is fit for that."""
@@ -345,6 +345,7 @@ class Odometry:
         return here._replace(
             tracker=self.aligner.start(frame),
             reference_timestamp=frame.timestamp,
+            reference_late=0.0,
             world_T_reference=before.world_T_camera,
             held=0,
             way=Way(),
@@ -382,13 +383,14 @@ class Odometry:
             after = after._replace(
                 tracker=attempt.state,
                 reference_timestamp=frame.timestamp,
+                reference_late=0.0,
                 world_T_reference=world_T_camera,
                 held=0,
                 way=Way(),
                 unknown=before.unknown + attempt.unknown if attempt.unknown else 0,
             )
         elif not attempt.unknown and UNFIT_FOR_WAY.isdisjoint(result.statuses):
-            since = frame.timestamp - before.reference_timestamp
+            since = before.since_reference(frame.timestamp)
             after = after._replace(way=before.way.after(since, np.asarray(result.xi, np.float64)))
         return after, result, False
 
@@ -401,7 +403,7 @@ class Odometry:
             timestamp: Timestamp of the new frame.
         """
         after = before._replace(held=before.held + 1)
-        if self.settings.odometry.on_lost == "predict" and timestamp > before.reference_timestamp:
-            motion = self.aligner.predict(before.tracker_at(timestamp), timestamp - before.reference_timestamp)
+        if self.settings.odometry.on_lost == "predict" and (since := before.since_reference(timestamp)) > 0:
+            motion = self.aligner.predict(before.tracker_at(timestamp), since)
             after = after._replace(world_T_camera=before.world_T_reference @ inverse(motion))
         return after if frame is None or after.held < MAX_HELD else self._restart(after, frame)

@@ -7,7 +7,7 @@ from jaxtyping import Float64
 
 from gavo_jax.bodies.records import Numbering
 from gavo_jax.datasets.base import Frame
-from gavo_jax.frame_checks import History
+from gavo_jax.frame_checks import History, credible_time
 from gavo_jax.odometry.aligners import expecting
 from gavo_jax.odometry.beginnings import Beginning
 from gavo_jax.odometry.depth_watch import DepthWatch
@@ -27,6 +27,8 @@ class Progress(NamedTuple):
     last_index: int = -1
     """Index of the last frame in the sequence."""
     reference_timestamp: float = 0.0
+    reference_late: float = 0.0
+    """Seconds by which that timestamp came too late, as the next ones told."""
     world_T_reference: Float64[np.ndarray, "4 4"] = np.eye(4)
     world_T_camera: Float64[np.ndarray, "4 4"] = np.eye(4)
     """Recorded pose of the last frame."""
@@ -58,10 +60,15 @@ class Progress(NamedTuple):
     numbering: Numbering = Numbering()
     """Numbers of the bodies so far."""
 
+    def since_reference(self, timestamp: float) -> float:
+        """Seconds from the reference's moment to a timestamp; 0 or less after a clock was set back."""
+        seconds = timestamp - self.reference_timestamp
+        return seconds + self.reference_late if seconds > 0 else seconds
+
     def tracker_at(self, timestamp: float) -> Any:
         """The aligner's state for a frame at a timestamp, with the motion predicted from the way so far."""
-        seconds = timestamp - self.reference_timestamp
-        xi = self.way.at(seconds)
+        seconds = self.since_reference(timestamp)
+        xi = self.way.at(seconds, self.history)
         return self.tracker if xi is None else expecting(self.tracker, xi, seconds)
 
     def in_new_segment(self) -> Self:
@@ -72,8 +79,10 @@ class Progress(NamedTuple):
     def clock(self, frame: Frame) -> Clock:
         """When a frame was taken that is already counted as the last one.
 
-        If the clock was set back since the reference, the elapsed time is unknown.
+        A timestamp that follows the reference's too soon for the recording's rate is wrong, or that one is. Then the
+        usual time counts: a velocity of a whole step in a fraction of its time would put shutter and depth far from
+        where they belong. If the clock was set back since the reference, the elapsed time is unknown.
         """
-        elapsed = frame.timestamp - self.reference_timestamp
-        elapsed = max(elapsed, 1e-3) if elapsed > 0 else UNKNOWN_SECONDS
+        elapsed = self.since_reference(frame.timestamp)
+        elapsed = credible_time(elapsed, self.history) if elapsed > 0 else UNKNOWN_SECONDS
         return Clock(np.float32(elapsed), np.float32(frame.depth_delay), np.uint32(self.last_index))

@@ -9,6 +9,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from jaxtyping import Float64
 
+from gavo_jax.frame_checks import History, credible_time
+
 REMEMBERED = 2
 """Number of frames that the last velocity is computed from."""
 
@@ -33,13 +35,14 @@ class Way(NamedTuple):
             return self._replace(fixes=())
         return self._replace(fixes=(*self.fixes, Fix(seconds, tuple(map(float, xi))))[-REMEMBERED:])
 
-    def at(self, seconds: float) -> Float64[np.ndarray, " 6"] | None:
+    def at(self, seconds: float, history: History) -> Float64[np.ndarray, " 6"] | None:
         """The twist to be expected `seconds` after the reference, at the last velocity.
 
-        This is None if no frame was found yet, or at a time that is not after the last one.
+        This is None if no frame was found yet, or at a time that is not after the last one. The history tells which
+        times between two frames are credible.
         """
         if not self.fixes or seconds <= self.fixes[-1].seconds:
             return None
         before, last = (Fix(0.0, (0.0,) * 6), *self.fixes)[-2:]
-        velocity = (np.array(last.xi) - before.xi) / max(last.seconds - before.seconds, 1e-3)
+        velocity = (np.array(last.xi) - before.xi) / credible_time(last.seconds - before.seconds, history)
         return np.array(last.xi) + (seconds - last.seconds) * velocity

@@ -71,6 +71,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     numbers = {
         "last_index": progress.last_index,
         "reference_timestamp": progress.reference_timestamp,
+        "reference_late": progress.reference_late,
         "held": progress.held,
         "way": progress.way.fixes,
         "segment": progress.segment,

@@ -120,6 +120,8 @@ def test_a_motion_that_took_another_time_is_not_the_frame_s_own() -> None:
         assert _own_velocity(step).any() == is_known
     unknown = result._replace(status=AlignmentStatus.OK, findings=0, covariance=UNDETERMINED**2 * np.eye(6))
     assert not _own_velocity(replace(step, alignment=unknown)).any()
+    fine = result._replace(status=AlignmentStatus.OK, findings=0)
+    assert [_own_velocity(replace(step, alignment=fine, timestamp=t)).any() for t in (0.1, 0.005)] == [True, False]
 
 
 def test_depth_that_turns_out_to_be_wrong_closes_no_loop() -> None:

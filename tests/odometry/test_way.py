@@ -7,6 +7,7 @@ import pytest
 from small import ALONE, CAMERA
 
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
+from gavo_jax.frame_checks import History
 from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS
 from gavo_jax.odometry.progress import Progress
@@ -23,20 +24,26 @@ SEARCH = Settings(GaussNewton(iterations=(0, 15, 0, 0, 20)), odometry=ALONE)
 def test_the_way_goes_on_at_the_last_velocity() -> None:
     step = np.array([0.01, 0.0, 0.0, 0.0, 0.02, 0.0])
     way = Way()
-    assert way.at(0.1) is None, "the motion before the reference tells"
+    assert way.at(0.1, History()) is None, "the motion before the reference tells"
     way = way.after(0.1, step)
-    assert way.at(0.2) == pytest.approx(2 * step)
+    assert way.at(0.2, History()) == pytest.approx(2 * step)
     way = way.after(0.2, 3 * step)
-    assert way.at(0.3) == pytest.approx(5 * step)
+    assert way.at(0.3, History()) == pytest.approx(5 * step)
     way = way.after(0.3, 3 * step)
-    assert way.at(0.5) == pytest.approx(3 * step) and len(way.fixes) == 2
-    assert way.at(0.3) is None and way.at(0.1) is None
+    assert way.at(0.5, History()) == pytest.approx(3 * step) and len(way.fixes) == 2
+    assert way.at(0.3, History()) is None and way.at(0.1, History()) is None
+
+
+def test_two_stamps_that_nearly_coincide_tell_no_velocity() -> None:
+    step = np.array([0.01, 0.0, 0.0, 0.0, 0.02, 0.0])
+    usual = History(intervals=(0.1,) * 5)
+    assert Way().after(0.1, step).after(0.102, 2 * step).at(0.2, usual) == pytest.approx(2.98 * step)
 
 
 def test_a_clock_that_is_set_back_tells_no_velocity() -> None:
     """The motion since the reference counted as that of a millisecond, and all that followed as implausible."""
     step = np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
-    assert Way().after(0.1, step).after(-49.9, step).at(-49.86) is None
+    assert Way().after(0.1, step).after(-49.9, step).at(-49.86, History()) is None
     frame = replace(SyntheticSequence(1, camera=CAMERA)[0], timestamp=40.0)
     clocks = [Progress(reference_timestamp=stamp, last_index=1).clock(frame) for stamp in (frame.timestamp - 0.1, 50.0)]
     assert [float(clock.elapsed) for clock in clocks] == pytest.approx([0.1, UNKNOWN_SECONDS])
