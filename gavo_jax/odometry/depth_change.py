@@ -36,6 +36,8 @@ reach 0.24, and 0.42 with a body over 40 % of the image.
 """
 MOST_WITHOUT_BODIES = 0.5
 """Part that is left without bodies over the one with them, below which bodies are why depth seemed wrong."""
+MOTIONS = 4
+"""Number of last motions that are remembered: those of 0.1 s at 30 frames per second, the longest delay of depth."""
 RIGHT_BEFORE = 5
 """Surplus of pairs whose change of depth was explained, counted from the first remembered one, that shows that depth
 was right until then.
@@ -53,8 +55,10 @@ class DepthChange(NamedTuple):
     """Inverse depth of the reference on a grid, 1/m; 0 without a reading."""
     delay: float
     """Time from the reference's colour image to its depth image, seconds."""
-    velocity: tuple[float, ...] = ()
-    """Velocity of the last motion found, a twist per second; empty before the first."""
+    before: tuple[tuple[float, ...], ...] = ()
+    """The last motions up to the reference, latest last: the seconds of each, and its velocity, a twist per second."""
+    since: tuple[float, ...] = ()
+    """The last motion found from the reference on, likewise; empty if there is none yet."""
     left: tuple[float, ...] = ()
     """Error of depth that the motion leaves over that which rest would leave, for each of the last pairs."""
 
@@ -107,7 +111,7 @@ class DepthChange(NamedTuple):
             with_bodies = self._left_in(frame, elapsed, twist, explained, camera)
             if left < min(MOST_LEFT, MOST_WITHOUT_BODIES * with_bodies):
                 figures = tuple(figure for figure in figures if figure <= MOST_LEFT)
-        return self._replace(velocity=tuple(twist.tolist()), left=figures)
+        return self._replace(since=(elapsed, *twist.tolist()), left=figures)
 
     def _left_in(
         self, frame: Frame, elapsed: float, twist: Float64[np.ndarray, "6"], explained: float, camera: Camera
@@ -117,11 +121,11 @@ class DepthChange(NamedTuple):
         Depth of a single value in both frames fits a wall along which the camera translates. Rotations are then found
         as translations, and depth agrees. So the image has to fit a wall as well.
         """
-        earlier = np.array(self.velocity or twist)
+        earlier = self.before or ((elapsed, *twist.tolist()),)
 
         def moved_by(seconds: float) -> Float64[np.ndarray, "4 4"]:
-            """Return the motion from the reference's image on; times before it use the earlier velocity."""
-            return exp(seconds * (twist if seconds > 0 else earlier))
+            """Return the motion from the reference's image on, or back to an earlier time."""
+            return exp(seconds * twist) if seconds > 0 else gone_back(-seconds, earlier)
 
         motion = moved_by(elapsed + frame.depth_delay) @ inverse(moved_by(self.delay))
         left = left_unexplained(self.inverse, np.asarray(frame.depth), motion, camera)
@@ -131,7 +135,18 @@ class DepthChange(NamedTuple):
 
     def seen_from(self, frame: Frame, camera: Camera) -> "DepthChange":
         """Continue with another reference."""
-        return self._replace(inverse=depth_on_grid(frame, camera), delay=frame.depth_delay)
+        before = (*self.before, self.since)[-MOTIONS:] if self.since else self.before
+        return DepthChange(depth_on_grid(frame, camera), frame.depth_delay, before, left=self.left)
+
+
+def gone_back(seconds: float, motions: tuple[tuple[float, ...], ...]) -> Float64[np.ndarray, "4 4"]:
+    """The motion from now back to an earlier time, along the last motions; the first of them goes on before it."""
+    result = np.eye(4)
+    for number, (duration, *velocity) in reversed(list(enumerate(motions))):
+        here = seconds if number == 0 else min(seconds, duration)
+        result = exp(-here * np.array(velocity)) @ result
+        seconds -= here
+    return result
 
 
 def depth_on_grid(frame: Frame, camera: Camera) -> Float64[np.ndarray, "rows columns"]:

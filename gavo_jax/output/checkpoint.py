@@ -158,8 +158,8 @@ def _progress_of(numbers: dict[str, Any], arrays: dict[str, np.ndarray]) -> Prog
         "numbering": Numbering(*numbers.get("numbering", ())),
     }
     if depth := numbers.get("depth"):
-        (delay, *known), seen, told = depth
-        change = DepthChange(arrays[INVERSE_DEPTH], delay, *map(tuple, known))
+        (delay, before, *known), seen, told = depth
+        change = DepthChange(arrays[INVERSE_DEPTH], delay, tuple(map(tuple, before)), *map(tuple, known))
         numbers["depth"] = DepthWatch(change, DepthEdges(arrays[EDGES], *seen), told)
     overlays = Overlays()
     if LAST_GREY in arrays:

@@ -20,6 +20,7 @@ from gavo_jax.odometry.depth_change import (
     REMEMBERED,
     DepthChange,
     depth_on_grid,
+    gone_back,
     left_unexplained,
 )
 from gavo_jax.odometry.depth_watch import DepthWatch
@@ -28,6 +29,7 @@ from gavo_jax.odometry.hindsight import revised
 from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.tracking import Clock
 from gavo_jax.output.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from gavo_jax.rigid_motions import exp
 from gavo_jax.status import AlignmentStatus
 from gavo_jax.trajectory import inverse
 
@@ -89,6 +91,29 @@ def as_disparity(depth: np.ndarray) -> np.ndarray:
 def test_depth_that_changes_as_the_camera_moves_is_right() -> None:
     steps = steps_of(room()[0])
     assert not any(flagged(steps)) and not any(step.revises for step in steps)
+
+
+def test_depth_of_two_frames_before_changed_as_the_camera_moved_then() -> None:
+    """Its speed changes from frame to frame: continued from the last motion, depth seemed to be wrong."""
+    frames, poses = room()
+    interval, chosen = 1 / 30, [0, 1, 4, 5, 8, 9, 12, 13, 16, 17]
+    change = None
+    for k, number in enumerate(chosen):
+        depth = frames[chosen[max(k - 2, 0)]].depth
+        frame = Frame(frames[number].grey, depth, k * interval, depth_timestamp=(k - 2) * interval)
+        if change is None:
+            change = DepthChange(depth_on_grid(frame, CAMERA), frame.depth_delay)
+            continue
+        motion = inverse(poses[number]) @ poses[chosen[k - 1]]
+        change = change.after(frame, frame, interval, motion, 1.0, CAMERA).seen_from(frame, CAMERA)
+    assert change is not None and len(change.left) >= 6 and max(change.left[3:]) < 0.3
+
+
+def test_the_way_back_follows_the_last_motions() -> None:
+    along, round_ = np.array([0.3, 0, 0, 0, 0, 0]), np.array([0, 0, 0, 0, 0.6, 0])
+    motions = ((0.1, *round_), (0.05, *along))
+    assert np.allclose(gone_back(0.02, motions), exp(-0.02 * along))
+    assert np.allclose(gone_back(0.25, motions), exp(-0.2 * round_) @ exp(-0.05 * along)), "the first goes on"
 
 
 @pytest.mark.parametrize(("damage", "silent"), [(turned_round, 3), (np.flipud, 0), (as_disparity, 0)])
