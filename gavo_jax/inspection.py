@@ -13,7 +13,7 @@ from gavo_jax.datasets.depth_doubts import doubt_of_depth, fault_of_depth
 from gavo_jax.datasets.depth_unit import name_of_unit
 from gavo_jax.datasets.rectified import rectified_at
 from gavo_jax.depth_edges import DepthEdges
-from gavo_jax.frame_checks import MAX_INTERVAL_RATIO, History, Use, check_frame, some_of
+from gavo_jax.frame_checks import MAX_INTERVAL_RATIO, MIN_INTERVAL_RATIO, History, Use, check_frame, some_of
 from gavo_jax.status import AlignmentStatus
 
 Facts = dict[str, Any]
@@ -158,6 +158,7 @@ def _times(stamps: np.ndarray) -> Facts:
         "rate_hz": 1 / interval if interval > 0 else None,
         "gaps": len(gaps),
         "longest_gap_s": float(gaps.max(initial=0.0)),
+        "too_soon": int(np.count_nonzero(intervals < MIN_INTERVAL_RATIO * interval)),
     }
 
 

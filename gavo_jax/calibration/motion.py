@@ -5,6 +5,7 @@ import numpy as np
 from gavo_jax.datasets.base import Frame, FrameError, Sequence
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoError
+from gavo_jax.frame_checks import MIN_INTERVAL_RATIO
 
 WINDOW = 45
 """Number of frames of a stretch, a second and a half; enough for several turns back and forth."""
@@ -21,7 +22,8 @@ def stretches_of_motion(sequence: Sequence) -> list[list[Frame]]:
     Raises:
         GavoError: none has enough frames.
     """
-    too_few = GavoError(f"{sequence.name}: needs at least {LEAST_FRAMES} readable frames in a row")
+    needed = f"{LEAST_FRAMES} readable frames in a row, none too soon after the last for the recording's rate"
+    too_few = GavoError(f"{sequence.name}: needs at least {needed}")
     if len(sequence) < LEAST_FRAMES:
         raise too_few
     count = min(len(sequence), MOST_SEARCHED)
@@ -59,16 +61,21 @@ def _changes(sequence: Sequence, count: int) -> np.ndarray:
 
 
 def _readable(sequence: Sequence, start: int, length: int) -> list[Frame]:
-    """Return the longest run of readable frames with increasing stamps."""
+    """Return the longest run of readable frames with increasing, credible stamps.
+
+    Where a frame comes too soon after the last, one of both stamps is wrong, and so is the speed between them.
+    """
     runs: list[list[Frame]] = [[]]
     camera = sequence.camera.rectified()
+    shortest = MIN_INTERVAL_RATIO * float(np.median(np.diff(sequence.timestamps)))
     for index in range(start, start + length):
         try:
             frame = rectified(sequence[index], camera)
         except FrameError:
             runs.append([])
             continue
-        if runs[-1] and frame.timestamp <= runs[-1][-1].timestamp:
+        if runs[-1] and not frame.timestamp - runs[-1][-1].timestamp > max(shortest, 0.0):
+            runs[-1].pop()
             runs.append([])
         runs[-1].append(frame)
     return max(runs, key=len)

@@ -66,7 +66,8 @@ def _time(facts: dict[str, Any]) -> str:
         several = ", the longest" if facts["gaps"] > 1 else ""
         gaps = f"{counted(facts['gaps'], 'gap')}{several} of {facts['longest_gap_s']:.2f} s"
     guess = f" ({facts['times_guessed']})" if facts["times_guessed"] else ""
-    return f"{facts['duration_s']:.2f} s from {facts['first_timestamp']:.6f}, {rate}{guess}, {gaps}"
+    soon = f", {counted(facts['too_soon'], 'frame')} too soon after the last" if facts["too_soon"] else ""
+    return f"{facts['duration_s']:.2f} s from {facts['first_timestamp']:.6f}, {rate}{guess}, {gaps}{soon}"
 
 
 def _camera(camera: dict[str, Any]) -> str:

@@ -225,6 +225,14 @@ def test_inspect_does_not_say_that_a_frame_after_a_gap_is_used_in_part(gavo, cli
     assert re.search(r"frames/s, 1 gap of \d\.\d\d s\n", done.out)
 
 
+def test_inspect_counts_frames_that_no_camera_of_that_rate_takes(gavo, clip):
+    for path in (clip / "rgb.txt", clip / "depth.txt"):
+        *rows, last = path.read_text().splitlines()
+        path.write_text("\n".join([*rows, f"{float(rows[-1].split()[0]) + 0.004:.6f} {last.split()[1]}"]) + "\n")
+    done = gavo("inspect", clip)
+    assert done.status == 0 and "frames/s, no gap, 1 frame too soon after the last\n" in done.out
+
+
 def test_inspect_as_json_counts_what_cannot_be_used(gavo, clip):
     rows = (clip / "rgb.txt").read_text().splitlines()
     torn, frozen = (clip / rows[at].split()[1] for at in (4, 7))
@@ -237,7 +245,7 @@ def test_inspect_as_json_counts_what_cannot_be_used(gavo, clip):
     assert [facts[key] for key in ("kind", "frames", "frames_used")] == ["TUM RGB-D folder", 7, 5]
     assert facts["frames_not_used"] == {"unreadable": 1, "frozen": 1} and torn.name in facts["why_not"][0]
     assert facts["left_out"] == ["1 colour images: no depth image within 0.02 s that is not paired with another"]
-    assert facts["rate_hz"] == pytest.approx(30, rel=1e-3) and facts["gaps"] == 0
+    assert facts["rate_hz"] == pytest.approx(30, rel=1e-3) and facts["gaps"] == facts["too_soon"] == 0
     assert facts["delay_of_depth_ms"] == {"median": 0, "least": 0, "most": 0}
     assert facts["camera"]["fx"] == 131 and facts["camera_from"].endswith("camera.toml")
     depth = facts["depth"]
