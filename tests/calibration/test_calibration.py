@@ -172,7 +172,7 @@ def test_a_readout_that_is_not_asked_for_is_what_the_camera_says(
     shape = (CAMERA.height, CAMERA.width)
 
     class Blank(list[Frame]):
-        name, camera = "blank", replace(CAMERA, readout=READOUT)
+        name, camera, timestamps = "blank", replace(CAMERA, readout=READOUT), np.arange(15) / 30
 
     sequence = Blank(Frame(np.zeros(shape, np.uint8), np.zeros(shape, np.uint16), i / 30) for i in range(15))
     estimate = estimate_camera(sequence, (wanted,), rounds=1)  # pyright: ignore

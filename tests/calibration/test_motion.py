@@ -26,6 +26,9 @@ class Stamped:
         grey = np.random.default_rng(index).integers(0, 255, (CAMERA.height, CAMERA.width)).astype(np.uint8)
         return Frame(grey, np.full(grey.shape, 5000, np.uint16), float(self.timestamps[index]))
 
+    def __iter__(self) -> Any:
+        return (self[i] for i in range(len(self)))
+
     def check(self) -> None:
         """Nothing to check."""
 
