@@ -116,6 +116,9 @@ MAX_USUAL_INTERVAL = 1.5
 MIN_INTERVAL_RATIO, MIN_INTERVAL = 0.4, 1e-3
 """Ratio of an interval to the usual one, and seconds, below which it can't be right: a camera that changes from 15 to
 30 images per second halves it."""
+BURST_RATIO, EQUAL = 0.2, 0.2
+"""Two intervals above this ratio that differ by less than this share are of a new rate: 30 images per second, after 7.5
+in the dark."""
 MIN_INTERVALS = 3
 """Number of known intervals before one can be unusual."""
 LONGEST_INTERVAL = 1e3
@@ -195,9 +198,15 @@ def seconds_late(timestamp: float, history: History) -> float:
 
 
 def credible_time(elapsed: float, history: History) -> float:
-    """The time between two frames in seconds, or the usual one if a camera of this rate can't be that fast."""
+    """The time between two frames in seconds, or the usual one if a camera of this rate can't be that fast.
+
+    A rate that has changed shows in two equal intervals; those of a burst are shorter.
+    """
     usual = median(history.intervals) if len(history.intervals) > MIN_INTERVALS else MIN_INTERVAL
-    return elapsed if elapsed >= MIN_INTERVAL_RATIO * usual else max(usual, MIN_INTERVAL)
+    before, last = history.intervals[-2:] if len(history.intervals) > 1 else (0.0, 0.0)
+    has_changed = min(before, last) > BURST_RATIO * usual and abs(last - before) < EQUAL * last
+    is_credible = elapsed >= (BURST_RATIO if has_changed else MIN_INTERVAL_RATIO) * usual
+    return elapsed if is_credible else max(usual, MIN_INTERVAL)
 
 
 def doubt_unit_of_time(index: int, history: History) -> None:

@@ -240,6 +240,14 @@ def test_a_time_that_no_camera_of_this_rate_needs_is_replaced_by_the_usual_one()
     assert credible_time(1e-9, History()) == 1e-3
 
 
+def test_a_rate_that_quadruples_is_believed_from_its_second_frame_on() -> None:
+    slow = (0.132,) * 5
+    told = [credible_time(0.033, History(intervals=(*slow, *fast))) for fast in ((0.033,), (0.033, 0.034))]
+    assert told == [0.132, 0.033]
+    assert credible_time(0.01, History(intervals=(*slow, 0.01, 0.01))) == 0.132, "a burst"
+    assert credible_time(0.033, History(intervals=(*slow, 0.045, 0.033))) == 0.132, "no rate yet"
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 16), (16, 1), (2, 2), (50, 3)])
 def test_images_of_a_few_pixels_are_no_fault(size: tuple[int, int]) -> None:
     camera, history = replace(CAMERA, height=size[0], width=size[1]), History()
