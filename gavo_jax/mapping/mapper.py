@@ -114,6 +114,7 @@ class Mapper:
             self._first = None
         if step.lost:
             return
+        self._take_back(step)
         twist = _own_velocity(step)
         if self._first is not None and not self.keyframes.all:
             is_reference = stamp_name(self._first.timestamp) == stamp_name(step.reference_timestamp)
@@ -254,8 +255,13 @@ class Mapper:
                 earlier = None if before in stamps else tracked.get(before)
                 step = earlier if earlier and earlier.index < step.index else None  # stamps may repeat
 
+    def _take_back(self, step: Step) -> None:
+        """Distrust the frames before a step that turn out to have followed a body: it may be all that they show."""
+        if AlignmentStatus.MOVING_BODY in step.alignment.statuses:
+            self._distrust(set(range(step.index - step.revises, step.index)))
+
     def _distrust(self, frames: set[int]) -> None:
-        """Drop loops and images of keyframes whose depth turned out to be wrong, by their frames' indices."""
+        """Drop loops and images of keyframes that turned out to be wrong, by their frames' indices."""
         wrong = {keyframe.number for keyframe in self.keyframes.all if keyframe.index in frames}
         self.edges = [edge for edge in self.edges if wrong.isdisjoint((edge.earlier, edge.later))]
         for keyframe in self.keyframes.searchable():

@@ -126,14 +126,35 @@ def test_a_motion_that_took_another_time_is_not_the_frame_s_own() -> None:
 
 def test_depth_that_turns_out_to_be_wrong_closes_no_loop() -> None:
     """Loops to frames that a later one found to have wrong depth stayed in the map."""
+    mapper = mapper_of_three()
+    mapper._distrust({1, 7})
+    assert [(edge.earlier, edge.later) for edge in mapper.edges] == [(0, 2)]
+    assert [keyframe.number for keyframe in mapper.keyframes.searchable()] == [0, 2]
+
+
+@pytest.mark.parametrize(
+    ("status", "left"), [(AlignmentStatus.MOVING_BODY, [0, 1]), (AlignmentStatus.IMPLAUSIBLE_MOTION, [0, 1, 2])]
+)
+def test_a_frame_that_turns_out_to_have_followed_a_body_is_no_place_in_the_map(
+    status: AlignmentStatus, left: list[int]
+) -> None:
+    """A frame was recognised by a card that filled it. That was told by the next, which was recognised by it."""
+    mapper = mapper_of_three()
+    result = with_finding(no_alignment(AlignmentStatus.OK), status)._replace(covariance=1e-6 * np.eye(6))
+    step = Step(3, WALK[2].timestamp, WALK[3].timestamp, result, np.eye(4), 1.0, False, origin="guessed", revises=1)
+    mapper.watch(None, step)
+    assert [keyframe.number for keyframe in mapper.keyframes.searchable()] == left
+    assert [edge.later for edge in mapper.edges] == left[1:]
+
+
+def mapper_of_three() -> Any:
+    """A map of three keyframes, with loops from the first to the others."""
     mapper: Any = Mapper(CAMERA)
     for index in range(3):
         mapper.keyframes.all.append(mapper.keyframes.make(WALK[index], index, 0, np.eye(4), np.zeros(6)))
         mapper.keyframes.all[-1].number = index
     mapper.edges = [Edge(0, 1, np.eye(4), np.eye(6)), Edge(0, 2, np.eye(4), np.eye(6))]
-    mapper._distrust({1, 7})
-    assert [(edge.earlier, edge.later) for edge in mapper.edges] == [(0, 2)]
-    assert [keyframe.number for keyframe in mapper.keyframes.searchable()] == [0, 2]
+    return mapper
 
 
 def test_a_reference_that_is_held_for_long_is_still_known() -> None:
