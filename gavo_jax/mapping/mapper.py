@@ -257,7 +257,7 @@ class Mapper:
 
     def _take_back(self, step: Step) -> None:
         """Distrust the frames before a step that turn out to have followed a body: it may be all that they show."""
-        if AlignmentStatus.MOVING_BODY in step.alignment.statuses:
+        if step.revises and AlignmentStatus.MOVING_BODY in step.alignment.statuses:
             self._distrust(set(range(step.index - step.revises, step.index)))
 
     def _distrust(self, frames: set[int]) -> None:

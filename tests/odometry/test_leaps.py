@@ -206,14 +206,18 @@ def test_a_leap_lasts_as_long_as_the_camera_needs_for_it(turn: float, speed: flo
 
 
 def real(
-    data_dir: Path, clip: str, numbers: list[int], moments: list[int] | None = None
+    data_dir: Path,
+    clip: str,
+    numbers: list[int],
+    moments: list[int] | None = None,
+    stamped: Callable[[NDArray[np.float64]], NDArray[np.float64]] = np.copy,
 ) -> tuple[list[Step], Callable[[Step], tuple[float, float]]]:
-    """`ga:fast` over frames of a clip under the stamps of its first ones; how far each step is from the truth, at the
-    moments of these frames or of others.
+    """`ga:fast` over frames of a clip under the stamps of its first ones, or what `stamped` makes of them; how far each
+    step is from the truth, at the moments of these frames or of others.
     """
     sequence = TumSequence(data_dir / clip)
-    truth, stamps = sequence.ground_truth, sequence.timestamps
-    of_truth = stamps[numbers if moments is None else moments]
+    truth, stamps = sequence.ground_truth, stamped(sequence.timestamps)
+    of_truth = sequence.timestamps[numbers if moments is None else moments]
     assert truth is not None
     odometry, steps = Odometry(sequence.camera, preset("ga", "fast")), []
     for number, stamp in zip(numbers, stamps, strict=False):

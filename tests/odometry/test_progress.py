@@ -1,21 +1,17 @@
 """What the driver believes of the time between two frames."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from gavo_jax.datasets.base import Frame
-from gavo_jax.datasets.layouts.tum import TumSequence
 from gavo_jax.frame_checks import History
-from gavo_jax.odometry.driver import Odometry
 from gavo_jax.odometry.plausibility import UNKNOWN_SECONDS
 from gavo_jax.odometry.progress import Progress
-from gavo_jax.presets import preset
-from gavo_jax.rigid_motions import length_and_angle
 from gavo_jax.status import AlignmentStatus
-from gavo_jax.trajectory import inverse
+from tests.odometry.test_leaps import real
 
 
 def test_the_time_between_two_frames() -> None:
@@ -32,19 +28,13 @@ def test_frames_that_were_stamped_when_they_arrived(data_dir: Path) -> None:
 
     Depth was moved along ten times the motion, the references with it, and for half a second nothing fitted.
     """
-    sequence = TumSequence(data_dir / "fr1_xyz")
-    odometry, truth, statuses, errors = Odometry(sequence.camera, preset("ga", "fast")), sequence.ground_truth, [], []
-    assert truth is not None
-    stamps = sequence.timestamps[:36] + 0.06 * (np.arange(36) % 10 == 9)
-    for i in range(1, len(stamps)):
-        stamps[i] = max(stamps[i], stamps[i - 1] + 0.002)
-    for i, stamp in enumerate(stamps):
-        frame = sequence[i]
-        step = odometry.register(replace(frame, depth_timestamp=stamp + frame.depth_delay), stamp)
-        if step is None:
-            continue
-        poses, _ = truth.interpolate(sequence.timestamps[[i - 1, i]])
-        error = inverse(inverse(poses[1]) @ poses[0]) @ np.asarray(step.alignment.target_T_reference)
-        statuses.append(step.alignment.status)
-        errors.append(length_and_angle(error)[0])
-    assert set(statuses) <= {AlignmentStatus.OK, AlignmentStatus.GAP} and max(errors) < 0.012
+    steps, off = real(data_dir, "fr1_xyz", [*range(36)], stamped=on_arrival)
+    assert {step.alignment.status for step in steps} <= {AlignmentStatus.OK, AlignmentStatus.GAP}
+    assert max(off(step)[0] for step in steps) < 0.012
+
+
+def on_arrival(stamps: NDArray[np.float64]) -> NDArray[np.float64]:
+    late = stamps + 0.06 * (np.arange(len(stamps)) % 10 == 9)
+    for i in range(1, len(late)):
+        late[i] = max(late[i], late[i - 1] + 0.002)
+    return late
