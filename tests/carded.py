@@ -30,32 +30,40 @@ TRACKED = Settings(GaussNewton(iterations=(0, 15, 0, 0, 20)), odometry=OdometryO
 
 
 class Carded:
-    """A still camera before a room; a textured card that covers a sixth of the image moves to the right, and stops."""
+    """A still camera before a room; a textured card that covers a sixth of the image moves to the right, and stops.
+
+    Args:
+        moves: Whether it moves at all.
+        stops: Frame from which on it stands still.
+        step: Its way from frame to frame, metres.
+        is_fine: Whether its texture is finer than what bodies are seen with.
+    """
 
     name, camera, ground_truth = "card", CAMERA, None
 
-    def __init__(self, moves: bool = True, stops: int = FRAMES) -> None:
+    def __init__(self, moves: bool = True, stops: int = FRAMES, step: float = STEP, is_fine: bool = False) -> None:
         self.scene = SyntheticSequence(frames=1, camera=CAMERA)[0]
         self.timestamps = np.arange(FRAMES) / 30
         rng = np.random.default_rng(0)
         blotches = [
             cv2.resize(rng.normal(0, 60, (n, 2 * n)), (144, 108), interpolation=cv2.INTER_CUBIC) for n in (6, 15)
         ]
-        self.texture = np.clip(blotches[0] + 0.5 * blotches[1] + 120, 10, 240)
-        self.steps = np.minimum(np.arange(FRAMES), stops) * moves
+        grain = rng.normal(0, 40, (108, 144)) if is_fine else blotches[0] + 0.5 * blotches[1]
+        self.texture = np.clip(grain + 120, 10, 240)
+        self.left = 60 + CAMERA.fx * step / DISTANCE * np.minimum(np.arange(FRAMES), stops) * moves
 
     def __len__(self) -> int:
         return FRAMES
 
     def mask(self, index: int) -> np.ndarray:
         """Pixels of the card."""
-        left = 60 + CAMERA.fx * STEP / DISTANCE * self.steps[index]
+        left = self.left[index]
         mask = np.zeros((CAMERA.height, CAMERA.width), bool)
         mask[40:148, round(left) : round(left) + 144] = True
         return mask
 
     def __getitem__(self, index: int) -> Frame:
-        left = 60 + CAMERA.fx * STEP / DISTANCE * self.steps[index]
+        left = self.left[index]
         grey, depth = self.scene.grey.astype(float), np.array(self.scene.depth)
         on = self.mask(index)
         v, u = np.nonzero(on)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from gavo_jax.bodies.pixel_evidence import PixelEvidence, View, gather_evidence
+from gavo_jax.bodies.pixel_evidence import PixelEvidence, View, box, gather_evidence
 from gavo_jax.camera import Camera
 from gavo_jax.image.pyramid import halve_grey, halve_inverse_depth
 
@@ -28,6 +28,8 @@ FAR = 12.0
 """Depth evidence above which a pixel shows another surface, rather than the same one moved."""
 SAME = 5.0
 """Depth evidence below which a pixel shows the same surface as before."""
+FOREIGN = 3.0
+"""Grey evidence about a pixel above which more of it says no more."""
 FADING = 0.4
 """Seconds in which a suspicion decays to 1/e."""
 RELEASED = -0.57
@@ -83,11 +85,12 @@ def form_belief(
     """
     evidence = gather_evidence(here, others, others_T_here, camera)
     known = _carry(before, evidence, _seen_before(evidence, SAME)) if carried else before
-    moves, rests = _weigh(evidence)
-    moves, rests = _box(moves), _box(rests)
+    grey = (here.image.grey & 255).astype(jnp.int32).astype(jnp.float32)
+    suspected_here = _after(suspected, evidence, grey) if carried and suspected is not None else jnp.zeros_like(before)
+    moves, rests = _weigh(evidence, suspected_here > 0)
+    moves, rests = box(moves), box(rests)
     news = jnp.clip((moves - 0.25 - rests) * 4.0, -1.0, 1.0) * jnp.clip(moves + rests, 0.0, 1.0)
     after = jnp.clip(BELIEF_DECAY * known + 0.5 * news, -1.0, 1.0)
-    grey = (here.image.grey & 255).astype(jnp.int32).astype(jnp.float32)
     moving = jax.lax.cond(
         jnp.mean(jnp.maximum(after, 0.0)) > MIN_MOVING_SHARE,
         lambda: share_out(after, grey, evidence.inverse_depth),
@@ -105,7 +108,7 @@ def form_belief(
         contradicted=jnp.sum(credit * (moving > 0)) / total,
         hidden=hidden,
         carried_belief=known,
-        suspected=_after(suspected, evidence, grey) if carried and suspected is not None else jnp.zeros_like(after),
+        suspected=suspected_here,
         in_view=jnp.sum(credit * evidence.seen, (1, 2)) / total,
     )
 
@@ -128,21 +131,42 @@ def suspect(
     return np.asarray(np.maximum(np.exp(-elapsed / FADING) * before, bodies), np.float32)
 
 
-def _weigh(e: PixelEvidence) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """How strongly each pixel indicates motion, and how strongly rest; both from 0 to 1."""
+def _weigh(e: PixelEvidence, was_body: Bool[Array, "h w"]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+    """How strongly each pixel indicates motion, and how strongly rest; both from 0 to 1.
+
+    Where a body was seen, the area about a pixel counts, too: its texture may be too fine for single pixels, and it may
+    move too little from frame to frame.
+
+    Args:
+        e: Evidence of the pixels.
+        was_body: Whether a body was seen on the pixel's surface.
+    """
     views = e.grey.shape[0]
     lenient = jnp.where(jnp.arange(views) > 0, 2.0, 1.0)[:, None, None]
     jump = jnp.abs(e.depth)
     small = e.depth > 0
     small |= jump < FAR * lenient
     consistent = (jump < 3.0 * lenient) | (e.measured == 0)
-    by_grey = consistent * jnp.clip(e.grey / (1.5 * lenient) - 1.0, 0.0, 1.0)
+    by_pixel = jnp.clip(e.grey / (1.5 * lenient) - 1.0, 0.0, 1.0)
+    by_area = jnp.clip((e.grey_around / lenient - 1.25) / 0.75, 0.0, 1.0) * jnp.clip(4.0 * e.unlike - 2.0, 0.0, 1.0)
+    by_grey = consistent * jnp.maximum(by_pixel, by_area * was_body)
     by_depth = small * jnp.clip(jump / (3.0 * lenient) - 1.0, 0.0, 1.0)
     moves = jnp.max(e.seen * jnp.maximum(by_grey, by_depth), axis=0)
-    at_rest = e.seen[0] * consistent[0] * (e.grey[0] < 1.0)
+    at_rest = e.seen[0] * consistent[0] * (e.grey[0] < 1.0) * ~(was_body & _differs(e, ~was_body))
     told = 0.1 + 0.4 * jnp.clip(e.texture[0] / 6.0, 0.0, 1.0)
     rests = at_rest * told * (1.0 - moves)
     return moves, rests
+
+
+def _differs(e: PixelEvidence, scene: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
+    """Where the grey around a pixel differs from that in an older view.
+
+    Where all of the `scene` differs, the view's pose or sharpness is to blame, and the limit is higher.
+    """
+    weight, around = e.seen[1:] * scene, e.grey_around[1:]
+    usual = jnp.sum(weight * jnp.minimum(around, FOREIGN), (1, 2)) / jnp.maximum(jnp.sum(weight, (1, 2)), 1.0)
+    differs = (around > jnp.maximum(1.0, 2.0 * usual)[:, None, None]) & (e.unlike[1:] > 0.3)
+    return jnp.any(differs, axis=0)
 
 
 def _carry(before: Float[Array, "h w"], e: PixelEvidence, same: Bool[Array, "h w"]) -> Float[Array, "h w"]:
@@ -175,12 +199,6 @@ def follow(suspected: Float[Array, "h w"], e: PixelEvidence, grey: Float[Array, 
         return jnp.where(same, s, jnp.maximum(s, around))
 
     return jax.lax.fori_loop(0, ENTERING, spread, _carry(suspected, e, same))
-
-
-def _box(image: Float[Array, "h w"]) -> Float[Array, "h w"]:
-    """Mean over a square of 5 x 5 pixels."""
-    padded = jnp.pad(image, 2, mode="edge")
-    return jax.lax.reduce_window(padded, 0.0, jax.lax.add, (5, 5), (1, 1), "VALID") / 25
 
 
 ROUNDS = (8, 12, 50)

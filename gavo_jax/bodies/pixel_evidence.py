@@ -64,6 +64,12 @@ class PixelEvidence(NamedTuple):
 
     grey: Float[Array, "v h w"]
     """Grey residual over what noise and a small shift of the image would cause; 0 where it cannot be told."""
+    grey_around: Float[Array, "v h w"]
+    """The same for the surface within a square of `AROUND` pixels, root mean square. Where texture finer than the
+    allowed shift moves, the area tells, though hardly any of its pixels does.
+    """
+    unlike: Float[Array, "v h w"]
+    """Mean square of its grey residual over the contrast of both views: 1 where these have nothing in common."""
     depth: Float[Array, "v h w"]
     """Inverse-depth residual in the same units: positive where the pixel shows a surface nearer than the one seen there
     before.
@@ -88,6 +94,10 @@ SLACK = 0.4
 """Pixels by which a correct motion may seem off, because of shutter, timestamps and registration of depth."""
 SLACK_OF_FLOW = 0.04
 """Additional slack for each pixel of image motion between neighbouring frames."""
+SAME_SURFACE = 3.0
+"""Depth evidence below which two pixels show the same surface."""
+AROUND = 5
+"""Side of the square over which evidence is averaged, pixels."""
 BRIGHTNESS_STRIDE = 16
 """One pixel in this many is used to estimate brightness."""
 
@@ -113,15 +123,38 @@ def gather_evidence(here: View, others: View, others_T_here: Float[Array, "v 4 4
     slack = SLACK + SLACK_OF_FLOW * flow
     shape = (views, height, width)
     told = lit_in_both(r)
+    jump = r.depth / (DEPTH_NOISE + slack * slope)
+    same = told * r.inside * (jnp.abs(jump) < SAME_SURFACE)
+
+    def around(value: Float[Array, "v n"]) -> Float[Array, "v h w"]:
+        return box((same * value).reshape(shape))
+
+    left, share = around(jnp.square(residual)), jnp.maximum(around(jnp.ones_like(residual)), 0.5)
+    allowed = around(GREY_NOISE**2 + jnp.square(slack * steep))
+    contrast = 2.0 * GREY_NOISE**2 * share
+    for image in (grey.value, r.grey_sample.value):
+        contrast += around(jnp.square(image)) - jnp.square(around(image)) / share
     return PixelEvidence(
         grey=(told * residual / (GREY_NOISE + slack * steep)).reshape(shape),
-        depth=(r.depth / (DEPTH_NOISE + slack * slope)).reshape(shape),
+        grey_around=jnp.sqrt(left / jnp.maximum(allowed, 0.5 * GREY_NOISE**2)),
+        unlike=left / jnp.maximum(contrast, GREY_NOISE**2),
+        depth=jump.reshape(shape),
         texture=(told * steep / GREY_NOISE).reshape(shape),
         seen=r.inside.reshape(shape),
         measured=r.depth_valid.reshape(shape),
         inverse_depth=q.reshape(height, width),
         place=jnp.stack([r.warped.u, r.warped.v], axis=1).reshape(views, 2, height, width),
     )
+
+
+def box(image: Float[Array, "*v h w"]) -> Float[Array, "*v h w"]:
+    """Mean over the square of `AROUND` pixels about each pixel."""
+    for axis in (-2, -1):
+        count = image.shape[axis]
+        ends = [(AROUND // 2, AROUND // 2) if image.ndim + axis == place else (0, 0) for place in range(image.ndim)]
+        padded = jnp.pad(image, ends, mode="edge")
+        image = sum(jax.lax.slice_in_dim(padded, k, k + count, axis=axis) for k in range(AROUND)) / AROUND
+    return image
 
 
 class Compared(NamedTuple):

@@ -1,12 +1,18 @@
 """What is believed of pixels: suspicions spread, fade, and end."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from carded import BOX, OTHER, Carded, beliefs, field
+from carded import BOX, CAMERA, DISTANCE, FRAMES, OTHER, TRACKED, Carded, beliefs, field, view
 
-from gavo_jax.bodies.belief import follow, suspect
-from gavo_jax.bodies.pixel_evidence import PixelEvidence
+from gavo_jax.bodies.belief import follow, form_belief, suspect
+from gavo_jax.bodies.pixel_evidence import PixelEvidence, gather_evidence
+from gavo_jax.bodies.scene import MotionSegmenter
+
+SEGMENTER = MotionSegmenter(CAMERA, TRACKED)
+SEEN_PIXEL = DISTANCE / SEGMENTER.camera.fx
+"""Step of the card, metres, by which it moves one pixel of the level that bodies are seen on."""
 
 
 def test_a_suspicion_spreads_to_what_comes_into_view_of_its_surface_and_no_further() -> None:
@@ -16,7 +22,7 @@ def test_a_suspicion_spreads_to_what_comes_into_view_of_its_surface_and_no_furth
     place = np.stack(np.meshgrid(columns.astype(np.float32), np.arange(20, dtype=np.float32)))[None]
     seen = np.broadcast_to((columns >= 6).astype(np.float32), shape)
     nothing, one = np.zeros(shape, np.float32), np.ones(shape, np.float32)
-    evidence = PixelEvidence(nothing, nothing, nothing, seen, one, near, place)  # pyright: ignore[reportArgumentType]
+    evidence = PixelEvidence(*[nothing] * 5, seen, one, near, place)  # pyright: ignore[reportArgumentType]
     before = np.broadcast_to(((columns >= 6) & (columns < 15)).astype(np.float32), shape[1:])
     after = np.asarray(follow(jnp.asarray(before), evidence, jnp.zeros(shape[1:])))
     np.testing.assert_array_equal(after, np.broadcast_to(columns < 15, shape[1:]))
@@ -32,7 +38,7 @@ def test_a_suspicion_of_what_was_not_measured_says_nothing_of_the_surface_that_s
     place = np.stack(np.meshgrid(columns.astype(np.float32), np.arange(20, dtype=np.float32)))[None]
     nothing, one = np.zeros(shape, np.float32), np.ones(shape, np.float32)
     measured = np.broadcast_to((columns < 15).astype(np.float32), shape)
-    evidence = PixelEvidence(nothing, nothing, nothing, one, measured, near, place)  # pyright: ignore[reportArgumentType]
+    evidence = PixelEvidence(*[nothing] * 5, one, measured, near, place)  # pyright: ignore[reportArgumentType]
     before = np.broadcast_to((columns < 20).astype(np.float32), shape[1:])
     after = np.asarray(follow(jnp.asarray(before), evidence, jnp.zeros(shape[1:])))
     np.testing.assert_array_equal(after, np.broadcast_to(columns < 15, shape[1:]))
@@ -50,3 +56,44 @@ def test_a_suspicion_fades_ends_where_all_is_at_rest_and_is_not_learnt_from_a_wr
     np.testing.assert_array_equal(kept, 1.0, "one that stopped seems to be at rest under a motion that follows it")
     nobody = belief._replace(suspected=np.zeros((60, 80)))  # pyright: ignore
     assert not np.any(suspect(nobody, body, 1 / 30, trusted=False))
+
+
+def on_card(card: Carded) -> np.ndarray:
+    """Pixels of the seen level that show the card in each of its frames, away from its edges."""
+    inside = np.logical_and.reduce([card.mask(index) for index in range(len(card))])
+    factor = CAMERA.height // SEGMENTER.size[0]
+    return inside.reshape(SEGMENTER.size[0], factor, SEGMENTER.size[1], factor).all(axis=(1, 3))
+
+
+@pytest.mark.parametrize(("pixels", "moves"), [(0.3, False), (1.5, True)])
+def test_texture_finer_than_a_seen_pixel_tells_by_its_area(pixels: float, moves: bool) -> None:
+    """A small shift may cause as much in each pixel, so a card with a fine grain seemed to be at rest."""
+    card = Carded(step=pixels * SEEN_PIXEL, is_fine=True)
+    before, here = (view(card[index].grey, card[index].depth, SEGMENTER.levels) for index in (0, 1))
+    others = jax.tree.map(lambda leaf: leaf[None], before)
+    seen, inside = gather_evidence(here, others, jnp.eye(4)[None], SEGMENTER.camera), on_card(card)
+    assert np.median(np.asarray(seen.grey[0])[inside]) < 1.0, "no pixel tells by itself"
+    share = np.mean(np.asarray(seen.grey_around[0])[inside] > 1.0)
+    assert share > 0.8 if moves else share < 0.02
+
+
+def belief_on_card(card: Carded, last: int, older: int, was_body: bool) -> float:
+    """Mean belief on a card after its last frame, 0.5 before, by two earlier frames as the other views."""
+    here, *others = (view(card[index].grey, card[index].depth, SEGMENTER.levels) for index in (FRAMES - 1, last, older))
+    two = jax.tree.map(lambda *leaves: jnp.stack(leaves), *others)
+    inside = on_card(card)
+    known, at_rest = jnp.where(jnp.asarray(inside), 0.5, 0.0), jnp.tile(jnp.eye(4), (2, 1, 1))
+    belief = form_belief(here, two, at_rest, SEGMENTER.camera, known, known * was_body, carried=True)
+    return float(np.asarray(belief.known)[inside].mean())
+
+
+def test_a_body_of_fine_texture_stays_one() -> None:
+    """It was lost after some frames, its points came back, and they led the camera on."""
+    card = Carded(step=1.5 * SEEN_PIXEL, is_fine=True)
+    assert belief_on_card(card, 3, 3, was_body=True) > 0.5 > 0.35 > belief_on_card(card, 3, 3, was_body=False)
+
+
+def test_a_body_that_slows_down_is_not_at_rest_as_the_older_view_tells() -> None:
+    card = Carded(step=0.3 * SEEN_PIXEL, is_fine=True)
+    assert belief_on_card(card, 3, 0, was_body=True) > 0.38
+    assert belief_on_card(card, 3, 0, was_body=False) < 0.3 and belief_on_card(card, 4, 4, was_body=True) < 0.3
