@@ -83,10 +83,12 @@ def form_belief(
         suspected: Earlier suspicion, for the pixels of the first other view; ignored unless `carried`.
         carried: Whether to carry `before` and `suspected` over from the first other view.
     """
-    evidence = gather_evidence(here, others, others_T_here, camera)
+    suspicion = suspected if carried else None
+    by_area = False if suspicion is None else jnp.any(suspicion > 0)
+    evidence = gather_evidence(here, others, others_T_here, camera, by_area)
     known = _carry(before, evidence, _seen_before(evidence, SAME)) if carried else before
     grey = (here.image.grey & 255).astype(jnp.int32).astype(jnp.float32)
-    suspected_here = _after(suspected, evidence, grey) if carried and suspected is not None else jnp.zeros_like(before)
+    suspected_here = jnp.zeros_like(before) if suspicion is None else _after(suspicion, evidence, grey)
     moves, rests = _weigh(evidence, suspected_here > 0)
     moves, rests = box(moves), box(rests)
     news = jnp.clip((moves - 0.25 - rests) * 4.0, -1.0, 1.0) * jnp.clip(moves + rests, 0.0, 1.0)
@@ -159,7 +161,7 @@ def _weigh(e: PixelEvidence, was_body: Bool[Array, "h w"]) -> tuple[Float[Array,
 
 
 def _differs(e: PixelEvidence, scene: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
-    """Where the grey around a pixel differs from that in an older view.
+    """Find where the grey around a pixel differs from that in an older view.
 
     Where all of the `scene` differs, the view's pose or sharpness is to blame, and the limit is higher.
     """

@@ -4,7 +4,7 @@ A search weighs a few points, the steepest ones. Here every pixel of one level c
 and not by its contrast.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -102,7 +102,9 @@ BRIGHTNESS_STRIDE = 16
 """One pixel in this many is used to estimate brightness."""
 
 
-def gather_evidence(here: View, others: View, others_T_here: Float[Array, "v 4 4"], camera: Camera) -> PixelEvidence:
+def gather_evidence(
+    here: View, others: View, others_T_here: Float[Array, "v 4 4"], camera: Camera, by_area: Any = True
+) -> PixelEvidence:
     """Gather the evidence of every pixel of a view against V other views.
 
     Args:
@@ -110,6 +112,7 @@ def gather_evidence(here: View, others: View, others_T_here: Float[Array, "v 4 4
         others: The views they are compared with, a leading axis V on every leaf.
         others_T_here: Maps points of the camera here into the cameras of the others.
         camera: Camera of the views' level.
+        by_area: Whether to gather `grey_around` and `unlike`, too, which are 0 otherwise; it may be traced.
     """
     width, height = camera.width, camera.height
     compared = compare(here, others, others_T_here, camera)
@@ -124,20 +127,27 @@ def gather_evidence(here: View, others: View, others_T_here: Float[Array, "v 4 4
     shape = (views, height, width)
     told = lit_in_both(r)
     jump = r.depth / (DEPTH_NOISE + slack * slope)
-    same = told * r.inside * (jnp.abs(jump) < SAME_SURFACE)
 
-    def around(value: Float[Array, "v n"]) -> Float[Array, "v h w"]:
-        return box((same * value).reshape(shape))
+    def area() -> tuple[Float[Array, "v h w"], Float[Array, "v h w"]]:
+        same = told * r.inside * (jnp.abs(jump) < SAME_SURFACE)
 
-    left, share = around(jnp.square(residual)), jnp.maximum(around(jnp.ones_like(residual)), 0.5)
-    allowed = around(GREY_NOISE**2 + jnp.square(slack * steep))
-    contrast = 2.0 * GREY_NOISE**2 * share
-    for image in (grey.value, r.grey_sample.value):
-        contrast += around(jnp.square(image)) - jnp.square(around(image)) / share
+        def around(value: Float[Array, "v n"]) -> Float[Array, "v h w"]:
+            return box((same * value).reshape(shape))
+
+        left, share = around(jnp.square(residual)), jnp.maximum(around(jnp.ones_like(residual)), 0.5)
+        allowed = around(GREY_NOISE**2 + jnp.square(slack * steep))
+        contrast = 2.0 * GREY_NOISE**2 * share
+        for image in (grey.value, r.grey_sample.value):
+            contrast += around(jnp.square(image)) - jnp.square(around(image)) / share
+        floor = GREY_NOISE**2
+        return jnp.sqrt(left / jnp.maximum(allowed, 0.5 * floor)), left / jnp.maximum(contrast, floor)
+
+    nothing = jnp.zeros(shape)
+    grey_around, unlike = jax.lax.cond(by_area, area, lambda: (nothing, nothing))
     return PixelEvidence(
         grey=(told * residual / (GREY_NOISE + slack * steep)).reshape(shape),
-        grey_around=jnp.sqrt(left / jnp.maximum(allowed, 0.5 * GREY_NOISE**2)),
-        unlike=left / jnp.maximum(contrast, GREY_NOISE**2),
+        grey_around=grey_around,
+        unlike=unlike,
         depth=jump.reshape(shape),
         texture=(told * steep / GREY_NOISE).reshape(shape),
         seen=r.inside.reshape(shape),
@@ -153,7 +163,8 @@ def box(image: Float[Array, "*v h w"]) -> Float[Array, "*v h w"]:
         count = image.shape[axis]
         ends = [(AROUND // 2, AROUND // 2) if image.ndim + axis == place else (0, 0) for place in range(image.ndim)]
         padded = jnp.pad(image, ends, mode="edge")
-        image = sum(jax.lax.slice_in_dim(padded, k, k + count, axis=axis) for k in range(AROUND)) / AROUND
+        shifted = [jax.lax.slice_in_dim(padded, k, k + count, axis=axis) for k in range(AROUND)]
+        image = sum(shifted, jnp.zeros_like(image)) / AROUND
     return image
 
 

@@ -1,5 +1,7 @@
 """What is believed of pixels: suspicions spread, fade, and end."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,14 +17,20 @@ SEEN_PIXEL = DISTANCE / SEGMENTER.camera.fx
 """Step of the card, metres, by which it moves one pixel of the level that bodies are seen on."""
 
 
+def evidence_of(seen: Any, measured: Any, inverse_depth: Any, place: Any) -> PixelEvidence:
+    """Evidence of pixels that agree with the other view."""
+    nothing: Any = np.zeros(seen.shape, np.float32)
+    agrees = {name: nothing for name in ("grey", "grey_around", "unlike", "depth", "texture")}
+    return PixelEvidence(**agrees, seen=seen, measured=measured, inverse_depth=inverse_depth, place=place)
+
+
 def test_a_suspicion_spreads_to_what_comes_into_view_of_its_surface_and_no_further() -> None:
     shape = 1, 20, 30
     columns = np.arange(30)
     near = np.broadcast_to(np.where(columns < 15, 1.0, 0.4), shape[1:]).astype(np.float32)
     place = np.stack(np.meshgrid(columns.astype(np.float32), np.arange(20, dtype=np.float32)))[None]
     seen = np.broadcast_to((columns >= 6).astype(np.float32), shape)
-    nothing, one = np.zeros(shape, np.float32), np.ones(shape, np.float32)
-    evidence = PixelEvidence(*[nothing] * 5, seen, one, near, place)  # pyright: ignore[reportArgumentType]
+    evidence = evidence_of(seen, np.ones(shape, np.float32), near, place)
     before = np.broadcast_to(((columns >= 6) & (columns < 15)).astype(np.float32), shape[1:])
     after = np.asarray(follow(jnp.asarray(before), evidence, jnp.zeros(shape[1:])))
     np.testing.assert_array_equal(after, np.broadcast_to(columns < 15, shape[1:]))
@@ -36,9 +44,8 @@ def test_a_suspicion_of_what_was_not_measured_says_nothing_of_the_surface_that_s
     columns = np.arange(30)
     near = np.broadcast_to(np.where(columns < 15, 1.0, 0.4), shape[1:]).astype(np.float32)
     place = np.stack(np.meshgrid(columns.astype(np.float32), np.arange(20, dtype=np.float32)))[None]
-    nothing, one = np.zeros(shape, np.float32), np.ones(shape, np.float32)
     measured = np.broadcast_to((columns < 15).astype(np.float32), shape)
-    evidence = PixelEvidence(*[nothing] * 5, one, measured, near, place)  # pyright: ignore[reportArgumentType]
+    evidence = evidence_of(np.ones(shape, np.float32), measured, near, place)
     before = np.broadcast_to((columns < 20).astype(np.float32), shape[1:])
     after = np.asarray(follow(jnp.asarray(before), evidence, jnp.zeros(shape[1:])))
     np.testing.assert_array_equal(after, np.broadcast_to(columns < 15, shape[1:]))
