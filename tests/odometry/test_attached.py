@@ -97,7 +97,7 @@ def test_another_size_begins_anew() -> None:
     assert attached.after(small_image.grey, np.eye(4)).moves == 0
 
 
-PLATES = cv2.resize(np.random.default_rng(0).uniform(60, 180, (3, 20)), (160, 24), interpolation=cv2.INTER_NEAREST)
+PLATES = cv2.resize(np.random.default_rng(0).uniform(60, 180, (3, 12)), (160, 24), interpolation=cv2.INTER_NEAREST)
 
 
 def plated(index: int, frame: Frame) -> Frame:
@@ -115,8 +115,9 @@ def test_a_run_is_not_held_by_a_part_in_view(monkeypatch: pytest.MonkeyPatch) ->
         return float(np.linalg.norm((moved[0] - moved[1])[:3, 3]))
 
     freed = error()
+    assert freed < 0.012
     monkeypatch.setattr(Attached, "after", lambda self, *_: self)
-    assert freed < 0.2 * error()
+    assert freed < 0.6 * error()  # what moves with the camera is a body in the scene, which helps for a while
 
 
 def test_frames_are_read_again_as_they_were_tracked() -> None:
