@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from gavo_jax.bodies.pixel_evidence import PixelEvidence, View, box, gather_evidence
+from gavo_jax.bodies.pixel_evidence import DEPTH_AGREES, PixelEvidence, View, box, gather_evidence
 from gavo_jax.camera import Camera
 from gavo_jax.image.pyramid import halve_grey, halve_inverse_depth
 
@@ -148,11 +148,11 @@ def _weigh(e: PixelEvidence, was_body: Bool[Array, "h w"]) -> tuple[Float[Array,
     jump = jnp.abs(e.depth)
     small = e.depth > 0
     small |= jump < FAR * lenient
-    consistent = (jump < 3.0 * lenient) | (e.measured == 0)
+    consistent = (jump < DEPTH_AGREES * lenient) | (e.measured == 0)
     by_pixel = jnp.clip(e.grey / (1.5 * lenient) - 1.0, 0.0, 1.0)
     by_area = jnp.clip((e.grey_around / lenient - 1.25) / 0.75, 0.0, 1.0) * jnp.clip(4.0 * e.unlike - 2.0, 0.0, 1.0)
     by_grey = consistent * jnp.maximum(by_pixel, by_area * was_body)
-    by_depth = small * jnp.clip(jump / (3.0 * lenient) - 1.0, 0.0, 1.0)
+    by_depth = small * jnp.clip(jump / (DEPTH_AGREES * lenient) - 1.0, 0.0, 1.0)
     moves = jnp.max(e.seen * jnp.maximum(by_grey, by_depth), axis=0)
     at_rest = e.seen[0] * consistent[0] * (e.grey[0] < 1.0) * ~(was_body & _differs(e, ~was_body))
     told = 0.1 + 0.4 * jnp.clip(e.texture[0] / 6.0, 0.0, 1.0)

@@ -94,8 +94,8 @@ SLACK = 0.4
 """Pixels by which a correct motion may seem off, because of shutter, timestamps and registration of depth."""
 SLACK_OF_FLOW = 0.04
 """Additional slack for each pixel of image motion between neighbouring frames."""
-SAME_SURFACE = 3.0
-"""Depth evidence below which two pixels show the same surface."""
+DEPTH_AGREES = 3.0
+"""Depth evidence below which depth agrees with the motion."""
 AROUND = 5
 """Side of the square over which evidence is averaged, pixels."""
 BRIGHTNESS_STRIDE = 16
@@ -128,22 +128,11 @@ def gather_evidence(
     told = lit_in_both(r)
     jump = r.depth / (DEPTH_NOISE + slack * slope)
 
-    def area() -> tuple[Float[Array, "v h w"], Float[Array, "v h w"]]:
-        same = told * r.inside * (jnp.abs(jump) < SAME_SURFACE)
-
-        def around(value: Float[Array, "v n"]) -> Float[Array, "v h w"]:
-            return box((same * value).reshape(shape))
-
-        left, share = around(jnp.square(residual)), jnp.maximum(around(jnp.ones_like(residual)), 0.5)
-        allowed = around(GREY_NOISE**2 + jnp.square(slack * steep))
-        contrast = 2.0 * GREY_NOISE**2 * share
-        for image in (grey.value, r.grey_sample.value):
-            contrast += around(jnp.square(image)) - jnp.square(around(image)) / share
-        floor = GREY_NOISE**2
-        return jnp.sqrt(left / jnp.maximum(allowed, 0.5 * floor)), left / jnp.maximum(contrast, floor)
-
+    same = told * r.inside * (jnp.abs(jump) < DEPTH_AGREES)
+    images = grey.value, r.grey_sample.value
+    of_area = [image.reshape(-1, height, width) for image in (residual, slack * steep, same, *images)]
     nothing = jnp.zeros(shape)
-    grey_around, unlike = jax.lax.cond(by_area, area, lambda: (nothing, nothing))
+    grey_around, unlike = jax.lax.cond(by_area, lambda: _around(*of_area), lambda: (nothing, nothing))
     return PixelEvidence(
         grey=(told * residual / (GREY_NOISE + slack * steep)).reshape(shape),
         grey_around=grey_around,
@@ -157,15 +146,37 @@ def gather_evidence(
     )
 
 
+def _around(
+    residual: Float[Array, "v h w"],
+    shift: Float[Array, "v h w"],
+    same: Float[Array, "v h w"],
+    *images: Float[Array, "#v h w"],
+) -> tuple[Float[Array, "v h w"], Float[Array, "v h w"]]:
+    """Return `grey_around` and `unlike` of `PixelEvidence`.
+
+    Args:
+        residual: Residuals, grey levels.
+        shift: What a small shift of the image would cause, grey levels.
+        same: 1 where both views show the same surface, else 0.
+        images: Grey of the view itself and of the others.
+    """
+    left, share = box(same * jnp.square(residual)), jnp.maximum(box(same), 0.5)
+    allowed = box(same * (GREY_NOISE**2 + jnp.square(shift)))
+    contrast = 2.0 * GREY_NOISE**2 * share
+    for image in images:
+        contrast += box(same * jnp.square(image)) - jnp.square(box(same * image)) / share
+    return jnp.sqrt(left / jnp.maximum(allowed, 0.5 * GREY_NOISE**2)), left / jnp.maximum(contrast, GREY_NOISE**2)
+
+
 def box(image: Float[Array, "*v h w"]) -> Float[Array, "*v h w"]:
     """Mean over the square of `AROUND` pixels about each pixel."""
-    for axis in (-2, -1):
-        count = image.shape[axis]
-        ends = [(AROUND // 2, AROUND // 2) if image.ndim + axis == place else (0, 0) for place in range(image.ndim)]
-        padded = jnp.pad(image, ends, mode="edge")
-        shifted = [jax.lax.slice_in_dim(padded, k, k + count, axis=axis) for k in range(AROUND)]
-        image = sum(shifted, jnp.zeros_like(image)) / AROUND
-    return image
+    height, width = image.shape[-2:]
+    ends = [(0, 0)] * (image.ndim - 2) + [(AROUND // 2, AROUND // 2)] * 2
+    padded = jnp.pad(image, ends, mode="edge")
+    first, *others = (padded[..., k : k + height, :] for k in range(AROUND))
+    columns = sum(others, first) / AROUND
+    first, *others = (columns[..., k : k + width] for k in range(AROUND))
+    return sum(others, first) / AROUND
 
 
 class Compared(NamedTuple):
