@@ -81,8 +81,8 @@ class Recovering(SecondThought):
         return attempt._replace(usable=confirmed and agree(attempt.result, again.result), fit=False)
 
 
-POLISHED = (AlignmentStatus.OK, AlignmentStatus.HIGH_ERROR)
-"""Statuses that a finer search may give to a motion that another one has found."""
+POLISHED = bit(AlignmentStatus.HIGH_ERROR)
+"""Findings that a finer search may have about a motion that another one has found."""
 SAME_BASIN = (0.05, 0.05)
 """Metres and radians within which a finer search ends in the same minimum."""
 
@@ -108,7 +108,7 @@ class Polished(SecondThought):
             return attempt
         guess = attempt.result.xi * (np.float32(state.seconds) / clock.elapsed)
         again = self.fine.align(state._replace(guess=guess), frame, clock)
-        if again.result.status not in POLISHED or not agree(attempt.result, again.result, SAME_BASIN):
+        if int(again.result.findings) & ~POLISHED or not agree(attempt.result, again.result, SAME_BASIN):
             return attempt
         result = again.result._replace(status=attempt.result.status, findings=attempt.result.findings)
         if result.explained.grey < MIN_EXPLAINED_GREY:

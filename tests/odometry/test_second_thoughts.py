@@ -16,6 +16,9 @@ from gavo_jax.status import AlignmentStatus
 IMPLAUSIBLE = with_finding(found(AlignmentStatus.HIGH_ERROR, 0.02), AlignmentStatus.IMPLAUSIBLE_MOTION)
 """A high error is the gravest of what speaks against it, and not all."""
 
+POORLY_KNOWN = with_finding(found(AlignmentStatus.HIGH_ERROR, 0.12), AlignmentStatus.LOW_TEXTURE)
+"""It may be off by decimetres: pairs of which it was the motion were `ok` with a deviation of 40 cm."""
+
 
 @pytest.mark.parametrize(
     "first, second, x",
@@ -59,6 +62,7 @@ def test_a_frame_that_is_not_explained_is_no_reference_while_the_old_one_is_in_r
         (found(AlignmentStatus.OK, 0.10), found(AlignmentStatus.OK, 0.12), 0.12),
         (found(AlignmentStatus.OK, 0.10), found(AlignmentStatus.OK, 0.16), 0.10),
         (found(AlignmentStatus.OK, 0.10), found(AlignmentStatus.LOW_TEXTURE, 0.12), 0.10),
+        (found(AlignmentStatus.OK, 0.10), POORLY_KNOWN, 0.10),
         (found(AlignmentStatus.AMBIGUOUS, 0.10), found(AlignmentStatus.OK, 0.12), 0.10),
     ],
 )
