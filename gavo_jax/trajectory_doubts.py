@@ -1,4 +1,4 @@
-"""Why a trajectory may disagree with another as a whole: the order of its quaternions, or its size."""
+"""Why a trajectory may disagree with another as a whole: the order of its quaternions, inverse poses, or its size."""
 
 from dataclasses import replace
 
@@ -7,14 +7,20 @@ from jaxtyping import Float
 
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import align_rigidly, relative_pose_error
-from gavo_jax.trajectory import Trajectory, quaternion_from_rotation, rotation_from_quaternion
+from gavo_jax.trajectory import Trajectory, inverse, quaternion_from_rotation, rotation_from_quaternion
 
 REORDERED, LARGE = 0.25, 2.0
 """Quaternions are taken to be w-first if that order leaves less than this share of the median rotation error over one
 second, and that error exceeds this many degrees."""
 
+FAR = 0.02
+"""Metres: the same for translations, where poses are taken to be inverted."""
+
 OTHER_SIZE = 1.15
 """Ratio of two sizes above which they differ."""
+
+UNITS_OF_LENGTH = {"millimetres": 1000.0, "centimetres": 100.0}
+"""Units that positions may be in instead of metres, by the number of them in a metre."""
 
 FEWEST_POSES = 10
 """Fewest poses that show a size."""
@@ -43,6 +49,29 @@ def is_w_first(trajectory: Trajectory, other: Trajectory) -> bool:
         return least > LARGE and error(quaternions[:, [1, 2, 3, 0]]) < REORDERED * least
     except GavoError:
         return False
+
+
+def is_inverse(trajectory: Trajectory, other: Trajectory) -> bool:
+    """Whether a file has its poses from world to camera, judged by another trajectory.
+
+    Their motions disagree, and agree once this one's poses are inverted; their rotations then agree no worse.
+    """
+
+    def errors(poses: Float[np.ndarray, "n 4 4"]) -> np.ndarray:
+        relative = relative_pose_error(other, replace(trajectory, world_T_camera=poses))
+        return np.array([relative.translation.median, relative.rotation.median])
+
+    try:
+        as_written, inverted = errors(trajectory.world_T_camera), errors(inverse(trajectory.world_T_camera))
+    except GavoError:
+        return False
+    is_better = as_written[0] > FAR and inverted[0] < REORDERED * as_written[0]
+    return bool(is_better and inverted[1] < max(as_written[1], LARGE))
+
+
+def unit_of_length(size: float) -> str | None:
+    """The unit that positions are in if they are `size` times too large; None if that is no unit's."""
+    return next((name for name, count in UNITS_OF_LENGTH.items() if 1 / OTHER_SIZE < size / count < OTHER_SIZE), None)
 
 
 def relative_size(estimate: Trajectory, truth: Trajectory) -> float | None:

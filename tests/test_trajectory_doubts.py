@@ -7,7 +7,7 @@ import pytest
 from paths import CLIPS, perturbed, real_pair, smooth_truth, transform
 
 from gavo_jax.trajectory import Trajectory, inverse, quaternion_from_rotation, rotation_from_quaternion
-from gavo_jax.trajectory_doubts import is_w_first, relative_size
+from gavo_jax.trajectory_doubts import is_inverse, is_w_first, relative_size, unit_of_length
 
 
 def w_first(trajectory: Trajectory) -> Trajectory:
@@ -27,6 +27,25 @@ def test_quaternions_of_the_other_order_are_told(data_dir, clip):
         assert not is_w_first(one, other) and not is_w_first(one, w_first(other))
     for one, other in ((noisy, truth), (truth, noisy), (estimate, inverted), (inverted, estimate)):
         assert not is_w_first(one, other)
+
+
+@pytest.mark.parametrize("clip", CLIPS)
+def test_poses_from_world_to_camera_are_told(data_dir, clip):
+    """The errors were ten times as large, and nothing said why."""
+    noisy, truth = real_pair(data_dir / clip)
+    estimate = perturbed(truth, noisy.timestamps, 0, 0.3)
+    inverted = Trajectory(truth.timestamps, inverse(truth.world_T_camera))
+    assert is_inverse(inverted, estimate)
+    for one, other in ((estimate, truth), (noisy, truth), (w_first(truth), estimate), (scaled(truth, 1e3), estimate)):
+        assert not is_inverse(one, other)
+
+
+@pytest.mark.parametrize(
+    ("size", "unit"), [(950.0, "millimetres"), (102.0, "centimetres"), (5.0, None), (1.0, None), (0.001, None)]
+)
+def test_positions_in_another_unit_are_told(size, unit):
+    """Of a truth in millimetres a run said that depth had 5 units per metre, and refused that."""
+    assert unit_of_length(size) == unit
 
 
 @pytest.mark.parametrize("axis", np.eye(3))

@@ -28,6 +28,9 @@ OFF_CENTRE, LIKE = 0.25, 0.1
 """Where the principal point is off the middle by such a share of it, and by nearly the same share along both sides,
 the numbers are of an image of another size."""
 
+FAR_OFF = 0.55
+"""Share of half a side by which a principal point may be off the middle, as in a cropped image."""
+
 MOST_K1, MOST_TANGENTIAL, MOST_RADIAL = 100.0, 1.0, 1000.0
 """Largest of OpenCV's coefficients; what is larger was meant as something else."""
 
@@ -243,7 +246,7 @@ def camera_from_table(path: Path | str, values: Table, depth_scale: float, part:
 
 
 def _check_middle(place: str, point: tuple[float, float], size: Size) -> None:
-    """Refuse a principal point that is the middle of an image of another size, or of one on its side."""
+    """Refuse a principal point that is the middle of an image of another size, or of one on its side, or far off."""
     x, y = (2 * at / side for at, side in zip(point, size, strict=True))
     across, down = (2 * at / side for at, side in zip(point, reversed(size), strict=True))
     is_off = abs(x - 1) > OFF_CENTRE / 2 and abs(y - 1) > OFF_CENTRE / 2
@@ -253,6 +256,11 @@ def _check_middle(place: str, point: tuple[float, float], size: Size) -> None:
         raise GavoError(
             f"{place}: {point[0]:g} {point[1]:g} is the middle of an image of about {other}, not of "
             f"{size[0]}x{size[1]}: {'rotate' if is_turned else 'scale'} fx, fy, cx and cy to match the images"
+        )
+    if max(abs(x - 1), abs(y - 1)) > FAR_OFF:
+        raise GavoError(
+            f"{place}: {point[0]:g} {point[1]:g} is far from the middle of an image of {size[0]}x{size[1]}: "
+            "exchanged with fx and fy, or of an image of another size?"
         )
 
 

@@ -14,6 +14,9 @@ OF_COLOR = re.compile(r"colou?r|rgb")
 OF_DEPTH = re.compile(r"(?<![a-z])(?:depth|infra(?:red)?|ir)\d*(?![a-z])")
 """Matches topics of the camera that depth belongs to; infrared images show its pattern of corners."""
 
+OF_SIDE = re.compile(r"(?<![a-z])(?:left|right)(?![a-z])")
+"""Matches topics of a stereo pair."""
+
 
 def is_kalibr(values: Table) -> bool:
     """Whether a file is a chain of cameras."""
@@ -45,7 +48,8 @@ def _is_depth_first(path: Path, *topics: str) -> bool:
     """
     colors = [bool(OF_COLOR.search(topic.lower())) for topic in topics]
     depths = [bool(OF_DEPTH.search(topic.lower())) and not color for topic, color in zip(topics, colors, strict=True)]
-    if depths[0] and not colors[1] or all(colors):
+    is_pair = all(OF_SIDE.search(topic.lower()) for topic in topics) and not any(colors + depths)
+    if depths[0] and not colors[1] or all(colors) or is_pair:
         raise GavoError(
             f"{path}: cam0 and cam1 are {topics[0][:60]} and {topics[1][:60]}: expected colour and depth (or the "
             "infrared image of its camera); if depth is registered to colour, write the colour camera alone as cam0"

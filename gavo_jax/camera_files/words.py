@@ -62,7 +62,7 @@ LEAST_UNITS = 0.05
 ORDER = {"pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), "fisheye": ("k1", "k2", "k3", "k4")}
 """Order of OpenCV's distortion coefficients, by model."""
 
-LOOKS_LIKE_A_LENS = re.compile(r"distort|^dist(?!ance)|fisheye|^depth.*(scale|factor|unit)")
+LOOKS_LIKE_A_LENS = re.compile(r"distort|^dist(?!ance)|^[kd]c$|coef|fisheye|^depth.*(scale|factor|unit)")
 
 MODELS = {
     "pinhole": "pinhole",

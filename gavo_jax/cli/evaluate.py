@@ -24,7 +24,7 @@ from gavo_jax.output.drawing import draw
 from gavo_jax.output.files import COMPARISON, FRAMES, prepare_folder, refuse_foreign
 from gavo_jax.output.screen import number, print_table, say, waiting
 from gavo_jax.trajectory import MAX_GAP, Trajectory, associate
-from gavo_jax.trajectory_doubts import is_w_first, relative_size
+from gavo_jax.trajectory_doubts import is_inverse, is_w_first, relative_size, unit_of_length
 
 UNITS = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
 """Units, in seconds, that timestamps may have instead of seconds."""
@@ -72,13 +72,21 @@ def _check(options: Evaluate) -> None:
 
 def _remarks(paths: tuple[Path, Path], read: list[tuple[Trajectory, float]]) -> Iterator[str]:
     """Yield a remark for each file that was not read literally, or disagrees as a whole, and for a truth in part."""
+    are_comparable = True
     for path, (one, unit), (other, _) in zip(paths, read, reversed(read), strict=True):
         if unit in UNITS:
             yield f"{path}: its stamps are taken as {UNITS[unit]}"
         if is_w_first(one, other):
             yield f"{path}: its rotations agree only if its quaternions are read as w x y z; write them as x y z w"
-    if size := relative_size(read[0][0], read[1][0]):
-        yield f"{paths[0]}: it has {size:.3g} times the size of {paths[1]}, and the errors do not allow for that"
+        elif is_inverse(one, other):
+            yield f"{path}: it agrees only if its poses are inverted; write them from camera to world"
+            are_comparable = False
+    if are_comparable and (size := relative_size(read[0][0], read[1][0])):
+        cause = "the errors do not allow for that"
+        for path, times in zip(paths, (size, 1 / size), strict=True):
+            if name := unit_of_length(times):
+                cause = f"{path} seems to be in {name}"
+        yield f"{paths[0]}: it has {size:.3g} times the size of {paths[1]}, and {cause}"
     (estimate, _), (truth, _) = read
     is_dense = len(truth) > 1 and np.median(np.diff(truth.timestamps)) <= MAX_GAP
     if is_dense and (part := covered_in_part(estimate, truth)):

@@ -21,6 +21,7 @@ from gavo_jax.cli.selection import (
 )
 from gavo_jax.datasets.assembly import recorded_as
 from gavo_jax.datasets.base import Sequence
+from gavo_jax.datasets.depth_doubts import doubt_of_limit
 from gavo_jax.datasets.depth_unit import doubt_of_guess, unit_of_file
 from gavo_jax.datasets.live.devices import is_live
 from gavo_jax.datasets.selection import SYNTHETIC
@@ -45,7 +46,7 @@ from gavo_jax.output.trajectories import formats, remove_trajectories, write_tra
 from gavo_jax.settings import Settings
 from gavo_jax.settings_check import as_seed
 from gavo_jax.trajectory import Trajectory
-from gavo_jax.trajectory_doubts import is_w_first, relative_size
+from gavo_jax.trajectory_doubts import is_inverse, is_w_first, relative_size, unit_of_length
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
 
@@ -116,10 +117,10 @@ def run(options: Run) -> int:
 
 
 def _remarks(options: Run, sequence: Sequence) -> Iterator[str]:
-    """Yield a line for what of the source is not used, a guessed unit of depth in doubt, and the settings."""
+    """Yield a line for what of the source is not used, each doubt about its depth, and the settings."""
     if line := left_out_in_short(sequence):
         yield f"{line}; metrics.json says why (left_out)"
-    if line := doubt_of_guess(sequence):
+    for line in filter(None, (doubt_of_guess(sequence), doubt_of_limit(sequence))):
         yield f"depth in doubt: {line}"
     if line := settings_line(options):
         yield line
@@ -135,9 +136,15 @@ def _doubts(trajectory: Trajectory, truth: Trajectory, units: float) -> Iterator
     """
     if is_w_first(truth, trajectory):
         yield "The ground truth agrees only if its quaternions are read as w x y z; write them as x y z w."
+    elif is_inverse(truth, trajectory):
+        yield "The ground truth agrees only if its poses are inverted; write them from camera to world."
+        return
     if size := relative_size(trajectory, truth):
         unit = f"{size * units:.4g} units per metre (--depth-scale), not {units:g}"
-        yield f"The trajectory has {size:.3g} times the size of the ground truth. It would agree if depth had {unit}."
+        cause = f"It would agree if depth had {unit}."
+        if name := unit_of_length(1 / size):
+            cause = f"The ground truth seems to be in {name}; write it in metres."
+        yield f"The trajectory has {size:.3g} times the size of the ground truth. {cause}"
 
 
 def _start(options: Run, sequence: Sequence, folder: RunFolder, config: dict[str, Any]) -> None:

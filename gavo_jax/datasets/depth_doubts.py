@@ -30,9 +30,9 @@ STRETCHES, DISTINCT = (257, 256), 16
 RAW_KINECT = 2047
 """Value of a missing reading in a Kinect's raw disparity, which has 11 bits."""
 
-MUCH, GAP = 0.05, 0.95
+MUCH, GAP, CLAMPED = 0.05, 0.95, 0.8
 """The farthest reading is a limit if at least this share of the readings equals it, and the next one is nearer than
-this part of it.
+`GAP` of it, or fewer are between `CLAMPED` of it and it.
 """
 
 ROUND_LIMIT = 5.0
@@ -116,8 +116,13 @@ def doubt_of_depth(sequence: FrameSequence) -> str | None:
     return "; ".join(filter(None, doubts)) or None
 
 
+def doubt_of_limit(sequence: FrameSequence) -> str | None:
+    """Describe a maximum at which depth was cut off; None if its first frames show none."""
+    return _limit(first_depths(sequence), unit_of_file(sequence))
+
+
 def _limit(depths: list[np.ndarray], scale: float) -> str | None:
-    """Describe a maximum that stands for missing readings, as simulators leave it; None if there is none."""
+    """Describe a maximum that stands for missing or farther readings, as simulators leave it; None if there is none."""
     images = [without_invalid(image) for image in depths]
     readings = np.concatenate([image[image > 0] for image in images]) if images else np.empty(0)
     if readings.size < MIN_READINGS:
@@ -127,7 +132,8 @@ def _limit(depths: list[np.ndarray], scale: float) -> str | None:
     if not nearer.size:
         return f"every reading is {most / scale:.4g} m"
     is_round = most / scale >= ROUND_LIMIT and most % scale == 0
-    if share < MUCH or not (is_round or nearer.max() < GAP * most):
+    is_clamp = np.mean((readings < readings.max()) & (readings > CLAMPED * readings.max())) < share
+    if share < MUCH or not (is_round or is_clamp or nearer.max() < GAP * most):
         return None
     return (
         f"{100 * share:.0f} % of the readings are {most / scale:.4g} m, the farthest: if that is a limit, or stands "

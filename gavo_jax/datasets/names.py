@@ -97,7 +97,7 @@ def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
     the bits per pixel), and the last is preferred. Names without a number are left out.
 
     Raises:
-        GavoError: no number is unique and in the order of the names, or `_check_start` fails; the message names a file.
+        GavoError: no number is unique and in the order of the names, or `check_start` fails; the message names a file.
     """
     both = [[file for file in files if _numbers(file)] for files in (color, depth)]
     others = tuple(file for file in (*color, *depth) if not _numbers(file))
@@ -108,7 +108,7 @@ def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
         odd = f"{both[0][0]}: more than one number in the names varies: keep one, or use timestamps as names"
         raise GavoError(next(filter(None, map(_fault, both)), odd))
     chosen = max(usable, key=lambda one: len(one.color.keys() & one.depth.keys()), default=Found({}, {}, others))
-    _check_start(chosen)
+    check_start(chosen)
     return chosen
 
 
@@ -121,7 +121,7 @@ def _varying(files: Sequence[Path]) -> list[int]:
     return varying if varying and shortest == longest else places
 
 
-def _check_start(found: Found) -> None:
+def check_start(found: Found) -> None:
     """Refuse gapless ranges of numbers that differ at both ends, or start alike with a ratio of lengths in `RATES`.
 
     It is then ambiguous whether images pair by number or by order. Where just one camera started or stopped late, one

@@ -448,7 +448,11 @@ def test_the_topics_of_two_cameras_say_which_is_of_colour(tmp_path, first, secon
 
 
 @pytest.mark.parametrize(
-    ("first", "second"), [("/infra1/image", "/infra2/image"), ("/ir/image", "/image"), ("/rgb/left", "/rgb/right")]
+    ("first", "second"),
+    [
+        *(("/infra1/image", "/infra2/image"), ("/ir/image", "/image"), ("/rgb/left", "/rgb/right")),
+        ("/stereo/left/image_raw", "/stereo/right/image_raw"),
+    ],
 )
 def test_two_cameras_of_one_kind_are_refused(tmp_path, first, second):
     """Of two infrared cameras, the first counted as that of colour."""
@@ -552,6 +556,8 @@ FAULTS = {
     "columns of a wide image.txt": ("910.5 640.2 910.1 360.3\n", "does not look like fx fy cx cy"),
     "smaller image.toml": (TOML.replace("640", "1280").replace("480", "960"), "about 639x479, not of 1280x960"),
     "landscape.txt": ("500 510 239.5 319.5\n", "middle of an image of about 479x639, not of 640x480: rotate fx"),
+    "exchanged.toml": (TOML.replace("cx=319.5", "cx=500").replace("cy=239.5", "cy=510"), "far from the middle of an"),
+    "wide.txt": ("920 0 640\n0 920 360\n0 0 1\n", "cx, cy: 640 360 is far from the middle of an image of 640x480"),
     "corner.toml": (TOML.replace("319.5", "0").replace("239.5", "0"), "middle of an image of about 0x0"),
     "negative.toml": (TOML.replace("510", "-510"), "fy: negative (-510), as in ICL-NUIM"),
     "negative.txt": ("481.2 -480.0 319.5 239.5\n", "fy: negative (-480.0), as in ICL-NUIM"),

@@ -17,7 +17,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import DEPTH_SCALE, Calibration, load_calibration
 from gavo_jax.datasets.clocks import in_seconds
 from gavo_jax.datasets.files import Entry, FileSequence, Reading, resolve_folder, size_of_most
-from gavo_jax.datasets.names import decimal_unit, filled_in, unit_of, unpaired
+from gavo_jax.datasets.names import Found, check_start, decimal_unit, filled_in, unit_of, unpaired
 from gavo_jax.datasets.own_camera import own_camera_file, preset_or_export
 from gavo_jax.datasets.truth import Counted, truth_in, unread_truth
 from gavo_jax.errors import GavoError, as_path, data_rows, number, without_heading
@@ -244,6 +244,9 @@ def _read_lists(root: Path, folder: Path, names: tuple[str, str], rate: float | 
     for row in (*color, *depth):
         if not abs(seconds[row.stamp]) < MAX_STAMP:
             raise GavoError(f"{row.place}: not a time stamp: {row.stamp:.15g}: expected seconds")
+    if both is None and unit in (1 / INDEX_RATE, 1 / rate if rate else None):
+        by_number = [{int(row.written): row.path for row in rows} for rows in (color, depth)]
+        check_start(Found(by_number[0], by_number[1]))
     color, depth = ([row._replace(stamp=seconds[row.stamp]) for row in rows] for rows in (color, depth))
     return _Lists(color, depth, unit, are_paired=both is not None, repeated=repeated)
 

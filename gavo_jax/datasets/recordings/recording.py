@@ -337,7 +337,7 @@ def _stamp(raw: Any, is_2: bool) -> float:
     if len(data) < 12:
         return 0.0
     order = "<" if not is_2 or data[1] & 1 else ">"
-    seconds, nanoseconds = struct.unpack(f"{order}II", data[4:12])
+    seconds, nanoseconds = struct.unpack(f"{order}{'i' if is_2 else 'I'}I", data[4:12])
     return seconds + nanoseconds * 1e-9
 
 

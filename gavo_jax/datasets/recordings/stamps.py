@@ -45,7 +45,7 @@ def in_one_time(color: Topic, depth: Topic) -> tuple[Topic, Topic]:
     """
     topics = color, depth
     if all(topic.stamps.any() and (len(topic.stamps) < 2 or np.ptp(topic.stamps)) for topic in topics):
-        color, depth = (topic._replace(stamps=np.where(topic.stamps > 0, topic.stamps, np.nan)) for topic in topics)
+        color, depth = (topic._replace(stamps=np.where(topic.stamps != 0, topic.stamps, np.nan)) for topic in topics)
     else:
         color, depth = (topic._replace(stamps=topic.received * 1e-9) for topic in topics)
     return color, depth

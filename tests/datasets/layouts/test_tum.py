@@ -213,6 +213,16 @@ def test_stamps_that_are_whole_numbers_count_what_gives_a_cameras_rate(folder, n
         np.testing.assert_allclose(np.diff(TumSequence(folder, CAMERA, rate=10.0).timestamps), 0.1)
 
 
+@pytest.mark.parametrize("rate", [None, 15.0])
+def test_lists_numbered_from_other_numbers_are_refused(folder, rate):
+    """Whether they pair by number or by order is not known; by number, drift grew by two thirds."""
+    for kind, first in (("rgb", 0), ("depth", 1)):
+        rows = [f"{first + i} {kind}/{i % 6}.png" for i in range(12)]
+        (folder / f"{kind}.txt").write_text("\n".join(rows) + "\n")
+    with pytest.raises(GavoError, match=r"colour images are 0 to 11, depth images 1 to 12: give those of one frame"):
+        TumSequence(folder, CAMERA, rate=rate)
+
+
 @pytest.mark.parametrize("offset", [0.033, -0.1, 10.0])
 @pytest.mark.parametrize("depth_first", [False, True])
 def test_pairs_that_a_list_says_are_frames_whatever_the_clock_of_depth(folder, offset, depth_first):

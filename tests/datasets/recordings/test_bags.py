@@ -807,6 +807,16 @@ def test_stamps_of_zero_stand_for_the_time_of_arrival(tmp_path, stamp):
     np.testing.assert_allclose(open_source(tmp_path / "zero", Reading(camera=CAMERA)).timestamps, [5.0, 5.1])
 
 
+def test_stamps_before_zero_are_read_as_such(tmp_path):
+    """Seconds of ROS 2 have a sign: half of such a bag was dropped, and its clock read 4294967294."""
+    recorder = Recorder(tmp_path / "early", "mcap")
+    for stamp in (-2.0, -1.0, 1.0):
+        recorder.image(COLOR, stamp, BGRS[0], "bgr8", stamp + 10)
+        recorder.image(DEPTH, stamp, MILLIMETRES[0], "16UC1", stamp + 10)
+    recorder.close()
+    np.testing.assert_allclose(open_source(tmp_path / "early", Reading(camera=CAMERA)).timestamps, [-2.0, -1.0, 1.0])
+
+
 def test_stamps_that_stand_still_stand_for_none(tmp_path):
     recorder = Recorder(tmp_path / "still", "mcap")
     for received in (5.0, 5.1, 5.2):
