@@ -79,12 +79,9 @@ class WithRival:
 
     Attributes:
         first: Finds the motion of a frame and its bodies.
-        is_fallback: Whether it is asked only where another search failed. A large motion may be the reason, or a body
-            that hides the scene, so it is always in question whose motion it finds.
     """
 
     first: BodyAware
-    is_fallback: bool = False
 
     @cached_property
     def second(self) -> BodyAware:
@@ -158,7 +155,7 @@ class WithRival:
         A new rival is made where there is none and the first motion is in doubt. It is also made where a surface comes
         to be in front of the rest while the question is open.
         """
-        rival, open_for, is_doubted = state.rival, state.open_for, self.is_fallback or bool(attempt.state.is_doubted)
+        rival, open_for, is_doubted = state.rival, state.open_for, bool(attempt.state.is_doubted)
         if rival.is_there or not attempt.usable or not (is_doubted or open_for.lasts):
             return rival, open_for
         rival = self._rival_of(state.first, standing_before=not is_doubted)

@@ -50,7 +50,7 @@ def with_recovery(aligner: Aligner, search: Search) -> Aligner:
         return with_bodies(first, careful_search)
     careful = DoubtingDepth(with_bodies(first, careful_search), with_bodies(careful_search, careful_search))
     wide = wide_search(search)
-    behind = with_bodies(Polished(wide, search), wide, is_fallback=True)
+    behind = with_bodies(Polished(wide, search), wide)
     # loading it takes seconds: a short run should save them, and a long one should not pause for them
     return Recovering(careful, behind, wide, is_loaded=search.settings.odometry.loops)
 
@@ -82,14 +82,8 @@ def with_light(aligner: AlignerKind, search: FrameSearch) -> AlignerKind | Relig
     return Relighting(aligner, search) if search.settings.odometry.relight else aligner
 
 
-def with_bodies(aligner: Aligner, search: FrameSearch, is_fallback: bool = False) -> Aligner:
-    """Wrap an aligner to leave out what moves on its own, where the search's settings ask for that.
-
-    Args:
-        aligner: The aligner.
-        search: The search behind it.
-        is_fallback: See `WithRival`.
-    """
+def with_bodies(aligner: Aligner, search: FrameSearch) -> Aligner:
+    """Wrap an aligner to leave out what moves on its own, where the search's settings ask for that."""
     if search.settings.odometry.bodies == "off":
         return aligner
-    return WithRival(BodyAware(aligner, search), is_fallback)
+    return WithRival(BodyAware(aligner, search))

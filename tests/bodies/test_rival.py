@@ -246,16 +246,6 @@ def test_as_long_as_it_is_open_whose_motion_is_found_a_rival_is_asked_for_once_s
     assert not aligner.align(alone._replace(open_for=OVER), frame, CLOCK).state.rival.is_there
 
 
-@pytest.mark.parametrize("is_fallback", [False, True])
-def test_whose_motion_the_fallback_finds_is_always_open(is_fallback: bool) -> None:
-    """A large card came in, the search failed, the wide one found the card's motion: 14 cm off in a pair, and ok."""
-    aligner, frame = rivalled([(True, 0.0, 1e-3)], [(True, 0.0, 1e-3)])
-    object.__setattr__(aligner, "is_fallback", is_fallback)
-    known = aligner.start(frame)._replace(rival=aligner._nobody, open_for=OVER)
-    state = aligner.align(known, frame, CLOCK).state
-    assert state.rival.is_there == state.open_for.lasts == is_fallback
-
-
 @pytest.mark.parametrize(
     ("open_for", "usable", "unknown"), [(Span(3, 0.1), True, 4), (Span(3, 0.1), False, 0), (OVER, True, 0)]
 )

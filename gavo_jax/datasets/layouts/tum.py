@@ -244,7 +244,7 @@ def _read_lists(root: Path, folder: Path, names: tuple[str, str], rate: float | 
     for row in (*color, *depth):
         if not abs(seconds[row.stamp]) < MAX_STAMP:
             raise GavoError(f"{row.place}: not a time stamp: {row.stamp:.15g}: expected seconds")
-    if both is None and unit in (1 / INDEX_RATE, 1 / rate if rate else None):
+    if both is None and are_whole and (rate or not unit_of(stamps)):  # frame numbers
         by_number = [{int(row.written): row.path for row in rows} for rows in (color, depth)]
         check_start(Found(by_number[0], by_number[1]))
     color, depth = ([row._replace(stamp=seconds[row.stamp]) for row in rows] for rows in (color, depth))
