@@ -607,6 +607,17 @@ def test_a_size_unlike_the_ground_truths_is_told(gavo, pristine, tmp_path, units
     assert "times the size" not in gavo("evaluate", truth, truth).out
 
 
+def test_a_run_tells_depth_that_was_cut_off(gavo, pristine, tmp_path):
+    source = tmp_path / "source"
+    shutil.copytree(pristine, source)
+    files = list(images(source, "depth"))
+    most = np.uint16(np.median(np.asarray(cv2.imread(str(files[0]), cv2.IMREAD_UNCHANGED))))
+    for file in files:
+        cv2.imwrite(str(file), np.minimum(np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)), most))
+    done = gavo("run", source, "--camera", pristine / "camera.toml", "--output", tmp_path / "out", *FAST)
+    assert done.status == 0 and re.search(r"depth in doubt: \d+ % of the readings are .* m, the farthest", done.out)
+
+
 def test_dark_corners_are_told_and_the_camera_file_removes_them(gavo, pristine, tmp_path):
     """They draw the motion with them, most in corridors, and every pair is ok."""
     source, out = tmp_path / "source", tmp_path / "out"
