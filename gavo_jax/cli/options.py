@@ -1,6 +1,6 @@
 """Arguments of the command: one dataclass per subcommand, from which tyro builds parser and help."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -303,5 +303,10 @@ Command = (
     | Annotated[Inspect, subcommand("inspect")]
     | Annotated[Calibrate, subcommand("calibrate")]
 )
-COMMANDS = tuple(get_args(command)[0].__name__.lower() for command in get_args(Command))
+OPTIONS = {
+    (of := get_args(command)[0]).__name__.lower(): {f"--{one.name.replace('_', '-')}" for one in fields(of)}
+    for command in get_args(Command)
+}
+"""Names of each command's options (and arguments), by the command's name."""
+COMMANDS = tuple(OPTIONS)
 """Names of the commands."""

@@ -9,11 +9,21 @@ import textwrap
 from collections.abc import Sequence
 from typing import TextIO
 
-from gavo_jax.cli.options import COMMANDS
+from gavo_jax.cli.options import COMMANDS, OPTIONS
 
 NUMBER = r"(?:could not convert string to float|invalid literal for int\(\) with base 10): (?P<value>.*)"
 UNION = r"no type matching .*(?P<kind>INT|FLOAT) could be instantiated from \[(?P<values>.*)\]\."
 CHOICE = r"invalid choice (?P<value>.*) for argument '(?P<name>[^']*)'\. Expected one of \((?P<choices>.*)\)\."
+
+ELSEWHERE = {
+    "--method": ("--solver", "--algorithm", "--optimizer"),
+    "--camera": ("--intrinsics", "--calibration", "--calib"),
+    "--colour-topic": ("--rgb-topic", "--image-topic"),
+    "--rate": ("--fps", "--framerate"),
+    "--viewer": ("--gui", "--visualize", "--visualise", "--show"),
+    "--frames": ("--limit", "--count", "--n-frames"),
+}
+"""Names that options have in other programs, by ours."""
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 HELP = ("-h", "--help")
@@ -105,7 +115,7 @@ def _in_words(said: str, first: Sequence[str], lines: Sequence[str], arguments: 
         name = found[1].rstrip(",")
         if name in itertools.dropwhile(lambda word: word != "--", arguments):
             return f"{name}: comes after --, which ends the options"
-        return _unknown(name, lines, f"gavo {command} --help")
+        return _unknown(name, lines, command)
     if said.startswith("Missing from"):
         names = [words[1] for line in first if (words := re.match(r" {4}(\S+)", line))]
         return f"missing: {', '.join(names)}"
@@ -131,14 +141,14 @@ def _no_command(arguments: Sequence[str]) -> str:
     return f"unknown command {arguments[0][:100]!r}; {hint}"
 
 
-def _unknown(name: str, lines: Sequence[str], page: str) -> str:
-    """Return the message on an unknown option, with a similar one that the page has, or on a surplus argument."""
+def _unknown(name: str, lines: Sequence[str], command: str) -> str:
+    """Return the message on an unknown option, with a similar one of the command, or on a surplus argument."""
     if not name.startswith("-"):
         return f"unexpected argument {name[:100]!r}"
-    like = ""
+    like, similar = "", [own for own, names in ELSEWHERE.items() if name in names and own in OPTIONS.get(command, ())]
     for line in lines:
         if found := re.match(r" +(--[\w-]+)", line):
             like = found[1]
-        elif like and line.endswith(f"in {page}"):
-            return f"unknown option {name[:100]}; did you mean {like}?"
-    return f"unknown option {name[:100]}"
+        elif like and line.endswith(f"in gavo {command} --help"):
+            similar.append(like)
+    return f"unknown option {name[:100]}" + (f"; did you mean {similar[0]}?" if similar else "")

@@ -363,6 +363,8 @@ USAGE = {
     "help": ("unknown command 'help'; expected one of run, compare,",),
     "run --frame 3": ("unknown option --frame; did you mean --frames? (see gavo run --help)",),
     "run -- FOLDER --frames 3": ("--frames: comes after --, which ends the options (see gavo run --help)",),
+    "run --solver ga": ("unknown option --solver; did you mean --method? (see gavo run --help)",),
+    "doctor --solver": ("unknown option --solver (see gavo doctor --help)",),
     "run --xyzzy": ("unknown option --xyzzy (see",),
     "doctor --json": ("unknown option --json (see gavo doctor --help)",),
     "run one two": ("unexpected argument 'two'",),
