@@ -345,6 +345,8 @@ def test_a_lens_model_holds_whatever_the_coefficients_are_called(tmp_path, name,
     [
         ({"my_distortion": RADTAN}, "'my_distortion': unknown, but looks like lens"),
         ({"dist_params": {"k1": 0.1}}, "'dist_params': unknown"),
+        ({"kc": RADTAN}, "'kc': unknown"),
+        ({"lens_coefficients": RADTAN}, "'lens_coefficients': unknown"),
         ({"depth_unit_scale": 0.001}, "'depth_unit_scale': unknown"),
         ({"depth_unit_m": 0.001}, "'depth_unit_m': unknown"),
         ({"depth_unit": 1.0}, "the unit of depth: expected metres per unit, below 0.05, or mm or m, found 1.0: write"),
