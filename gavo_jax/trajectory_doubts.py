@@ -62,11 +62,13 @@ def is_inverse(trajectory: Trajectory, other: Trajectory) -> bool:
         return np.array([relative.translation.median, relative.rotation.median])
 
     try:
-        as_written, inverted = errors(trajectory.world_T_camera), errors(inverse(trajectory.world_T_camera))
+        as_written = errors(trajectory.world_T_camera)
+        if not as_written[0] > FAR:
+            return False
+        inverted = errors(inverse(trajectory.world_T_camera))
     except GavoError:
         return False
-    is_better = as_written[0] > FAR and inverted[0] < REORDERED * as_written[0]
-    return bool(is_better and inverted[1] < max(as_written[1], LARGE))
+    return bool(inverted[0] < REORDERED * as_written[0] and inverted[1] < max(as_written[1], LARGE))
 
 
 def unit_of_length(size: float) -> str | None:

@@ -22,7 +22,7 @@ from gavo_jax.cli.selection import (
 from gavo_jax.datasets.assembly import recorded_as
 from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.depth_doubts import doubt_of_limit
-from gavo_jax.datasets.depth_unit import doubt_of_guess, unit_of_file
+from gavo_jax.datasets.depth_unit import doubt_of_guess, first_depths, unit_of_file
 from gavo_jax.datasets.live.devices import is_live
 from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED, LOST
@@ -120,7 +120,8 @@ def _remarks(options: Run, sequence: Sequence) -> Iterator[str]:
     """Yield a line for what of the source is not used, each doubt about its depth, and the settings."""
     if line := left_out_in_short(sequence):
         yield f"{line}; metrics.json says why (left_out)"
-    for line in filter(None, (doubt_of_guess(sequence), doubt_of_limit(sequence))):
+    depths = [] if options.sequence == SYNTHETIC else first_depths(sequence)  # rendering them would take time
+    for line in filter(None, (doubt_of_guess(sequence, depths), doubt_of_limit(sequence, depths))):
         yield f"depth in doubt: {line}"
     if line := settings_line(options):
         yield line

@@ -1,7 +1,7 @@
 """Depth images that contain something other than depth: swapped bytes, stretched pictures, disparity, limits.
 
 Each is recognised by a property that true depth never has, whatever the scene. A run refuses what `fault_of_depth`
-finds; only `gavo inspect` reports what `doubt_of_depth` finds.
+finds, and reports what `doubt_of_limit` finds; only `gavo inspect` reports all that `doubt_of_depth` finds.
 """
 
 import itertools
@@ -112,27 +112,28 @@ def doubt_of_depth(sequence: FrameSequence) -> str | None:
     """Describe what is unusual in the depth of a sequence, besides a `fault_of_depth`; None if nothing is."""
     depths = first_depths(sequence)
     of_scale = None if _fault(sequence, depths) else doubt_of_scale(sequence, depths)
-    doubts = (of_scale, _limit(depths, unit_of_file(sequence)), _inverse(sequence))
+    doubts = (of_scale, doubt_of_limit(sequence, depths), _inverse(sequence))
     return "; ".join(filter(None, doubts)) or None
 
 
-def doubt_of_limit(sequence: FrameSequence) -> str | None:
-    """Describe a maximum at which depth was cut off; None if its first frames show none."""
-    return _limit(first_depths(sequence), unit_of_file(sequence))
+def doubt_of_limit(sequence: FrameSequence, depths: list[np.ndarray]) -> str | None:
+    """Describe a maximum that stands for missing or farther readings, as simulators leave it; None if there is none.
 
-
-def _limit(depths: list[np.ndarray], scale: float) -> str | None:
-    """Describe a maximum that stands for missing or farther readings, as simulators leave it; None if there is none."""
-    images = [without_invalid(image) for image in depths]
+    Args:
+        sequence: The sequence.
+        depths: Its `first_depths`.
+    """
+    scale, images = unit_of_file(sequence), [without_invalid(image) for image in depths]
     readings = np.concatenate([image[image > 0] for image in images]) if images else np.empty(0)
     if readings.size < MIN_READINGS:
         return None
     most = float(readings.max())
-    share, nearer = float(np.mean(readings == readings.max())), readings[readings < readings.max()]
+    nearer = readings[readings < most]
+    share = 1.0 - nearer.size / readings.size
     if not nearer.size:
         return f"every reading is {most / scale:.4g} m"
     is_round = most / scale >= ROUND_LIMIT and most % scale == 0
-    is_clamp = np.mean((readings < readings.max()) & (readings > CLAMPED * readings.max())) < share
+    is_clamp = np.count_nonzero(nearer > CLAMPED * most) < share * readings.size
     if share < MUCH or not (is_round or is_clamp or nearer.max() < GAP * most):
         return None
     return (

@@ -1,7 +1,7 @@
 """Parsing of image file names: which number distinguishes the frames, and whether it is a timestamp."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from os.path import commonprefix
 from pathlib import Path
@@ -108,7 +108,7 @@ def by_number(color: Sequence[Path], depth: Sequence[Path]) -> Found:
         odd = f"{both[0][0]}: more than one number in the names varies: keep one, or use timestamps as names"
         raise GavoError(next(filter(None, map(_fault, both)), odd))
     chosen = max(usable, key=lambda one: len(one.color.keys() & one.depth.keys()), default=Found({}, {}, others))
-    check_start(chosen)
+    check_start(chosen.color, chosen.depth)
     return chosen
 
 
@@ -121,14 +121,13 @@ def _varying(files: Sequence[Path]) -> list[int]:
     return varying if varying and shortest == longest else places
 
 
-def check_start(found: Found) -> None:
+def check_start(color: Mapping[int, Path], depth: Mapping[int, Path]) -> None:
     """Refuse gapless ranges of numbers that differ at both ends, or start alike with a ratio of lengths in `RATES`.
 
     It is then ambiguous whether images pair by number or by order. Where just one camera started or stopped late, one
     end agrees; but the starts also agree where one camera is several times as fast. Ranges with gaps are refused, too,
     if both ends differ alike, and as many images pair with that shift. Fewer than `FEWEST` images pass.
     """
-    color, depth, _ = found
     few, many = sorted(map(len, (color, depth)))
     if few < FEWEST:
         return

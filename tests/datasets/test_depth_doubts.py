@@ -8,6 +8,7 @@ import pytest
 from written_folders import CAMERA, CAMERA_TOML, GREYS, METRES, image, kinect, raw
 
 from gavo_jax.datasets.depth_doubts import doubt_of_depth, doubt_of_limit, fault_of_depth
+from gavo_jax.datasets.depth_unit import first_depths
 from gavo_jax.datasets.registry import open_source
 from gavo_jax.datasets.selection import open_part
 from gavo_jax.errors import GavoError
@@ -82,8 +83,8 @@ def test_a_limit_in_place_of_no_reading_is_told(tmp_path: Path, ending: str, lim
 @pytest.mark.parametrize(("limit", "words"), [(1.5, "of the readings are 1.5 m, the farthest"), (2.8, None)])
 def test_depth_that_was_cut_off_is_told(tmp_path: Path, limit: float, words: str | None) -> None:
     """What lay behind became a wall that moved with the camera: drift grew fivefold, and all pairs were ok."""
-    depths = [raw(np.minimum(metres, limit), 1000) for metres in METRES]
-    doubt = doubt_of_limit(open_source(source(tmp_path, depths)))
+    sequence = open_source(source(tmp_path, [raw(np.minimum(metres, limit), 1000) for metres in METRES]))
+    doubt = doubt_of_limit(sequence, first_depths(sequence))
     assert doubt is None if words is None else doubt and words in doubt
 
 

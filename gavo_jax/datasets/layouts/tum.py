@@ -17,7 +17,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.camera_files.calibration import DEPTH_SCALE, Calibration, load_calibration
 from gavo_jax.datasets.clocks import in_seconds
 from gavo_jax.datasets.files import Entry, FileSequence, Reading, resolve_folder, size_of_most
-from gavo_jax.datasets.names import Found, check_start, decimal_unit, filled_in, unit_of, unpaired
+from gavo_jax.datasets.names import check_start, decimal_unit, filled_in, unit_of, unpaired
 from gavo_jax.datasets.own_camera import own_camera_file, preset_or_export
 from gavo_jax.datasets.truth import Counted, truth_in, unread_truth
 from gavo_jax.errors import GavoError, as_path, data_rows, number, without_heading
@@ -238,26 +238,21 @@ def _read_lists(root: Path, folder: Path, names: tuple[str, str], rate: float | 
     if rate and not are_whole:
         raise GavoError(f"{folder}: --rate applies to numbered frames, but these have timestamps")
     stamps = [row.stamp for row in color]
-    unit = _unit(stamps, rate) if are_whole else decimal_unit(stamps) or 1.0
+    of_clock = None if rate else unit_of(stamps) if are_whole else decimal_unit(stamps) or 1.0
+    unit = of_clock or 1 / (rate or INDEX_RATE)
     counts = [row.stamp for row in (*color, *depth)]
     seconds = dict(zip(counts, in_seconds(counts, unit), strict=True))
     for row in (*color, *depth):
         if not abs(seconds[row.stamp]) < MAX_STAMP:
             raise GavoError(f"{row.place}: not a time stamp: {row.stamp:.15g}: expected seconds")
-    if both is None and are_whole and (rate or not unit_of(stamps)):  # frame numbers
-        by_number = [{int(row.written): row.path for row in rows} for rows in (color, depth)]
-        check_start(Found(by_number[0], by_number[1]))
+    if both is None and of_clock is None:  # frame numbers
+        check_start(*({int(row.written): row.path for row in rows} for rows in (color, depth)))
     color, depth = ([row._replace(stamp=seconds[row.stamp]) for row in rows] for rows in (color, depth))
     return _Lists(color, depth, unit, are_paired=both is not None, repeated=repeated)
 
 
 WHOLE = re.compile(r"-?\d+")
 """A stamp that may be in any unit or a frame number; 2.000000 is in seconds."""
-
-
-def _unit(color: list[float], rate: float | None) -> float:
-    """The likely unit of whole numbers, seconds; frame numbers count intervals at the rate."""
-    return 1 / rate if rate else unit_of(color) or 1 / INDEX_RATE
 
 
 def _read_pairs(root: Path, path: Path) -> tuple[list[_Row], list[_Row]]:
