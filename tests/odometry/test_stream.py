@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import jax
+import numpy as np
 import pytest
 from driving import CAMERA, FRAMES, PLAIN, SEARCH_ALONE, Altered, run, unreadable
 
@@ -15,7 +16,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Step
-from gavo_jax.odometry.stream import track
+from gavo_jax.odometry.stream import decoded, track
 
 
 def test_on_lost_stop_ends_the_run(sequence: SyntheticSequence) -> None:
@@ -50,6 +51,24 @@ def test_streams(sequence: SyntheticSequence) -> None:
     assert threading.get_ident() not in threads
     assert most[0] <= 4
     assert all(step.alignment is own.alignment for step, own in zip(told, result.steps, strict=True))
+
+
+def test_a_sequence_may_decode_into_the_same_arrays(sequence: SyntheticSequence) -> None:
+    """The next frame is decoded while one is aligned; poses were wrong, each time others, and the pairs `ok`."""
+    grey, depth = np.empty_like(sequence[0].grey), np.empty_like(sequence[0].depth)
+    is_read = [threading.Event() for _ in range(FRAMES)]
+
+    def alter(index: int, frame: Frame) -> Frame:
+        np.copyto(grey, frame.grey)
+        np.copyto(depth, frame.depth)
+        is_read[index].set()
+        return replace(frame, grey=grey, depth=depth)
+
+    for index, frame in enumerate(decoded(Altered(sequence, alter))):
+        assert is_read[min(index + 1, FRAMES - 1)].wait(10.0)
+        assert isinstance(frame, Frame)
+        np.testing.assert_array_equal(frame.grey, sequence[index].grey)
+        np.testing.assert_array_equal(frame.depth, sequence[index].depth)
 
 
 def test_who_watches_sees_the_stamps_of_the_sequence(sequence: SyntheticSequence) -> None:
