@@ -70,7 +70,7 @@ def _readable(sequence: Sequence, start: int, length: int) -> list[Frame]:
     shortest = MIN_INTERVAL_RATIO * float(np.median(np.diff(sequence.timestamps)))
     for index in range(start, start + length):
         try:
-            frame = rectified(sequence[index], camera)
+            frame = rectified(sequence[index], camera).copied()
         except FrameError:
             runs.append([])
             continue

@@ -134,6 +134,11 @@ class Frame:
         delay = 0.0 if self.depth_timestamp is None else self.depth_timestamp - self.timestamp
         return delay if abs(delay) <= MOST_DELAY + SAME_STAMP else 0.0
 
+    def copied(self) -> "Frame":
+        """The frame in arrays of its own, for who keeps it: a source may decode the next one into the same arrays."""
+        color = None if self.color is None else np.array(self.color)
+        return replace(self, grey=np.array(self.grey), depth=np.array(self.depth), color=color)
+
     def at(self, timestamp: float) -> "Frame":
         """The same images with another stamp; depth keeps its delay, unless beyond `MOST_DELAY`.
 

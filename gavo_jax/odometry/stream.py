@@ -2,9 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-
-import numpy as np
 
 from gavo_jax.datasets.base import Frame, FrameError, Sequence, require_sequence
 from gavo_jax.datasets.rectified import rectified_at
@@ -58,18 +55,12 @@ def track(
                 return
 
 
-def _copied(frame: Frame) -> Frame:
-    """A frame in arrays of its own: a sequence may decode the next one into the same arrays meanwhile."""
-    color = None if frame.color is None else np.array(frame.color)
-    return replace(frame, grey=np.array(frame.grey), depth=np.array(frame.depth), color=color)
-
-
 def decoded(sequence: Sequence, first: int = 0) -> Iterator[Frame | FrameError]:
     """Yield frames at the sequence's timestamps, or errors in their place; a thread decodes the next one meanwhile."""
 
     def read(index: int) -> Frame | FrameError:
         try:
-            return _copied(rectified_at(sequence, index))
+            return rectified_at(sequence, index).copied()
         except FrameError as error:
             return error
 

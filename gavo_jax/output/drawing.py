@@ -95,7 +95,7 @@ def _landscape_of(sequence: Sequence, odometry: Odometry, step: Step) -> Landsca
     settings = odometry.settings
     levels = dict.fromkeys((settings.solver.levels[0], settings.solver.levels[-1]))
     try:
-        frames = sequence[_reference_of(sequence, step)], sequence[step.index]
+        frames = sequence[_reference_of(sequence, step)].copied(), sequence[step.index]
     except FrameError:
         return None
     return error_landscape(*frames, odometry.camera, step.alignment, settings.alignment, tuple(levels))
