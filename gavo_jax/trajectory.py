@@ -47,11 +47,10 @@ class Trajectory:
     segments: Int[np.ndarray, " n"] = None  # pyright: ignore[reportAssignmentType]
 
     def __post_init__(self) -> None:
-        """Convert all to arrays; raise ValueError if they are not numbers or their shapes do not match."""
-        with blamed("Trajectory: expected numbers"):
-            timestamps = np.asarray(self.timestamps, np.float64)
-            world_T_camera = np.asarray(self.world_T_camera, np.float64)
-            given = None if self.segments is None else np.asarray(self.segments, int)
+        """Copy all to arrays; raise ValueError if they are not numbers or their shapes do not match."""
+        timestamps = _numbers("timestamps", self.timestamps).astype(np.float64)
+        world_T_camera = _numbers("world_T_camera", self.world_T_camera).astype(np.float64)
+        given = None if self.segments is None else _numbers("segments", self.segments, "iu").astype(int)
         if timestamps.ndim != 1 or world_T_camera.shape != (len(timestamps), 4, 4):
             raise ValueError(f"expected shapes [n] and [n, 4, 4], got {timestamps.shape} and {world_T_camera.shape}")
         object.__setattr__(self, "timestamps", timestamps)
@@ -149,8 +148,9 @@ class Trajectory:
         """Write the upper 3×4 of each matrix, row by row, twelve numbers per line (KITTI odometry format, no stamps).
 
         Raises:
-            GavoError: the file cannot be written; no partial file is left.
+            GavoError: a pose is not a rigid transform, or the file cannot be written; no partial file is left.
         """
+        self.require_rigid()
         rows = self.world_T_camera[:, :3].reshape(len(self), 12)
         write_lines(path, (" ".join(_digits(value, 9) for value in row) for row in rows))
 
@@ -212,6 +212,16 @@ def require_trajectory(trajectory: Any) -> None:
     if not isinstance(trajectory, Trajectory):
         hint = "gavo.Trajectory.read_tum(path) or gavo.Trajectory(timestamps, world_T_camera)"
         raise GavoError(f"expected a Trajectory, got {type(trajectory).__name__}: {hint}")
+
+
+def _numbers(name: str, values: Any, kinds: str = "iuf") -> np.ndarray:
+    """An array of one of the kinds of numbers; a date would become a number of whatever unit it has."""
+    with blamed("Trajectory: expected numbers"):
+        array = np.asarray(values)
+    if array.size and array.dtype.kind not in kinds:
+        whole = "" if "f" in kinds else "whole "
+        raise GavoError(f"Trajectory: expected {whole}numbers: {name} has {array.dtype}")
+    return array
 
 
 def _as_stamps(stamps: Any) -> Float[np.ndarray, "*m"]:

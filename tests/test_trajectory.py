@@ -188,6 +188,9 @@ def test_missing_files_and_folders_are_refused(tmp_path):
     (tmp_path / "folder").mkdir()
     with pytest.raises(GavoError, match="cannot be written"):
         random_trajectory(2, 0).write_kitti(tmp_path / "folder")
+    with pytest.raises(GavoError, match="pose 1 of 2 is not a rigid transform"):
+        Trajectory([0.0, 1.0], [np.eye(4), 2 * np.eye(4)]).write_kitti(tmp_path / "kitti.txt")
+    assert not (tmp_path / "kitti.txt").exists()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["folder"]
 
 
@@ -278,11 +281,27 @@ def test_interpolation_at_what_is_no_stamp_is_refused(arguments: tuple, words: s
 
 @pytest.mark.parametrize(
     "arguments",
-    [(["a"], [np.eye(4)]), ([0.0], [["a"]]), ([0.0, 1.0], [[1.0], [1.0, 2.0]]), ([0.0], [np.eye(4)], ["first"])],
+    [
+        (["a"], [np.eye(4)]),
+        ([0.0], [["a"]]),
+        ([0.0, 1.0], [[1.0], [1.0, 2.0]]),
+        ([0.0], [np.eye(4)], ["first"]),
+        (np.array(["2026-01-01"], "datetime64[ns]"), [np.eye(4)]),
+        (np.array([1], "timedelta64[ms]"), [np.eye(4)]),
+        ([0.0], [np.eye(4)], [0.5]),
+    ],
 )
 def test_what_is_no_number_makes_no_trajectory(arguments: tuple):
-    with pytest.raises(GavoError, match="^Trajectory: expected numbers: "):
+    with pytest.raises(GavoError, match="^Trajectory: expected (whole )?numbers: "):
         Trajectory(*arguments)
+
+
+def test_a_trajectory_does_not_change_with_the_arrays_that_it_was_made_of():
+    stamps, poses = np.arange(3.0), np.tile(np.eye(4), (3, 1, 1))
+    trajectory = Trajectory(stamps, poses, segments := np.zeros(3, int))
+    stamps[:], poses[:], segments[:] = 7.0, np.nan, 7
+    assert trajectory.timestamps[2] == 2.0 and np.isfinite(trajectory.world_T_camera).all()
+    assert not trajectory.segments.any()
 
 
 def test_one_place_of_a_trajectory_is_no_trajectory():
