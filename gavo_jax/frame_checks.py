@@ -121,8 +121,10 @@ BURST_RATIO, EQUAL = 0.2, 0.2
 in the dark."""
 MIN_INTERVALS = 3
 """Number of known intervals before one can be unusual."""
-LONGEST_INTERVAL = 1e3
-"""If the first intervals are all longer than so many seconds, the timestamps are hardly in seconds."""
+LONGEST_INTERVAL = 10.0
+"""If the first intervals are all longer than so many seconds, the timestamps are hardly in seconds; at 30 frames a second
+milliseconds are 33 apart.
+"""
 ROW_STEP = 4
 THUMBNAIL = 5
 """Smallest side of the thumbnail in pixels, if the image has as many."""
