@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8, UInt16
 
 from gavo_jax.errors import GavoError
+from gavo_jax.image.numbers import as_array
 
 MIN_SIDE, MAX_SIDE = 16, 8192
 """Smallest and largest image width or height accepted, in pixels: the coarsest of five levels is 16 times smaller."""
@@ -113,9 +114,11 @@ class Camera:
         Centres map as c' = (c + 1/2) / n - 1/2. Distortion is unchanged: it acts on normalised coordinates.
 
         Raises:
-            GavoError: `pixels` is no whole number of at least 1.
+            GavoError: `pixels` is no whole number of at least 1, or larger than the image.
         """
         _require_counts(pixels=pixels)
+        if pixels > min(self.width, self.height):
+            raise GavoError(f"pixels: an image of {self.width}x{self.height} cannot be {pixels} times smaller")
         fx, fy, cx, cy = self.scaled(1 / pixels)
         size = {"width": self.width // pixels, "height": self.height // pixels}
         return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, **size)
@@ -184,12 +187,12 @@ class Camera:
         if self.is_rectified:
             return image
         self._check_size(image)
-        image = _in_own_order(image)
+        image = as_array(image)
         if self.is_distorted:
-            coordinates, fractions, _ = _undistortion_maps(self._on_host())
+            coordinates, fractions, _ = undistortion_maps(self.on_host())
             image = cv2.remap(image, coordinates, fractions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         if any(self.vignetting):
-            gain = vignetting_gain(self._on_host())
+            gain = vignetting_gain(self.on_host())
             gain = gain if image.ndim == 2 else cv2.merge([gain] * image.shape[2])
             kind = cv2.CV_8U if image.dtype == np.uint8 else cv2.CV_32F
             image = np.minimum(cv2.multiply(image, gain, dtype=kind), 255)
@@ -206,12 +209,12 @@ class Camera:
         if not self.is_distorted:
             return depth
         self._check_size(depth)
-        depth = _in_own_order(depth)
-        _, _, nearest = _undistortion_maps(self._on_host())
+        depth = as_array(depth)
+        _, _, nearest = undistortion_maps(self.on_host())
         none = np.empty(0, np.float32)
         return cv2.remap(depth, nearest, none, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
 
-    def _on_host(self) -> "Camera":
+    def on_host(self) -> "Camera":
         """Return the same camera with Python floats, which are hashable."""
         values = {name: float(getattr(self, name)) for name in ("fx", "fy", "cx", "cy", "depth_scale", "readout")}
         return replace(self, **values)
@@ -265,54 +268,10 @@ PRESETS = {
 dataset (Palazzolo et al. 2019) and of the rendered ICL-NUIM (Handa et al. 2014)."""
 
 
-DISTORTION_COUNTS = {"pinhole": (4, 5, 8, 12, 14), "fisheye": (4,)}
-"""Numbers of distortion coefficients that OpenCV accepts, by model."""
-
-
-def require_camera(camera: Camera) -> None:
-    """Check that a value is a camera with valid parameters and images large enough for a pyramid.
-
-    Raises:
-        GavoError: It is not: a side has fewer than `MIN_SIDE` pixels or a focal length is not positive, say.
-    """
-    if not isinstance(camera, Camera):
-        raise GavoError(f"expected a Camera, got {type(camera).__name__}: gavo.Camera(…) or gavo.Camera.preset(name)")
-    for name, least in {"fx": 0.0, "fy": 0.0, "cx": -np.inf, "cy": -np.inf, "depth_scale": 0.0}.items():
-        if not (_is_number(value := getattr(camera, name)) and value > least):
-            raise GavoError(f"camera: {name}: expected a {'positive ' * (least == 0)}number, got {value!r}")
-    if not (_is_number(camera.readout) and 0 <= camera.readout <= 1):
-        raise GavoError(f"camera: readout: expected seconds from 0 to 1, got {camera.readout!r}")
-    if camera.model not in DISTORTION_COUNTS:
-        raise GavoError(f"camera: model: expected one of {', '.join(DISTORTION_COUNTS)}, got {camera.model!r}")
-    counts, distortion = DISTORTION_COUNTS[camera.model], camera.distortion
-    if not (isinstance(distortion, tuple) and len(distortion) in (0, *counts) and all(map(_is_number, distortion))):
-        raise GavoError(
-            f"camera: distortion: expected a tuple of {', '.join(map(str, counts))} numbers, got {distortion!r}"
-        )
-    if not (isinstance(camera.vignetting, tuple) and all(map(_is_number, camera.vignetting))):
-        raise GavoError(f"camera: vignetting: expected a tuple of numbers, got {camera.vignetting!r}")
-    if any(camera.vignetting) and (doubt := doubt_about_gain(camera)):
-        raise GavoError(f"camera: vignetting: {doubt}")
-    if min(camera.width, camera.height) < MIN_SIDE:
-        size = f"{camera.width}x{camera.height}"
-        raise GavoError(f"images of {size} are too small: the search needs at least {MIN_SIDE} pixels per side")
-
-
 def _require_counts(**counts: Any) -> None:
     for name, value in counts.items():
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
             raise GavoError(f"{name}: expected a whole number of at least 1, got {value!r}")
-
-
-def _in_own_order(image: np.ndarray) -> np.ndarray:
-    """An image in the machine's byte order, as OpenCV reads any."""
-    return image if image.dtype.isnative else image.astype(image.dtype.newbyteorder("="))
-
-
-def _is_number(value: Any) -> bool:
-    """Whether a value is a finite real number of Python, NumPy or JAX."""
-    array = np.asarray(value)
-    return array.ndim == 0 and array.dtype.kind in "iuf" and bool(np.isfinite(array))
 
 
 def _stack(*arrays: Any) -> Any:
@@ -340,7 +299,7 @@ def _reach(distortion: tuple[float, ...], model: str) -> float:
 
 
 @lru_cache(maxsize=8)
-def _undistortion_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def undistortion_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return fixed-point maps for cv2.remap: coordinates and fractions (bilinear), coordinates (nearest)."""
     matrix, distortion, size = camera.matrix, np.array(camera.distortion), (camera.width, camera.height)
     make = cv2.fisheye.initUndistortRectifyMap if camera.model == "fisheye" else cv2.initUndistortRectifyMap
@@ -361,20 +320,6 @@ def vignetting_gain(camera: Camera) -> Float[np.ndarray, "height width"]:
     """Return the factor by which each pixel of an undistorted image is brightened."""
     x, y = to_ray(camera, np.arange(camera.width), np.arange(camera.height)[:, None])
     return np.polyval([*camera.vignetting[::-1], 1.0], x**2 + y**2).astype(np.float32)
-
-
-LEAST_GAIN, MOST_GAIN = 0.5, 10.0
-"""Smallest and largest factor by which vignetting is undone."""
-
-
-def doubt_about_gain(camera: Camera) -> str:
-    """Return why the coefficients of vignetting must be meant for another unit of radius, pixels say; else nothing."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        gain = vignetting_gain(camera._on_host())
-    if gain.min() >= LEAST_GAIN and gain.max() <= MOST_GAIN:
-        return ""
-    spread = f"multiplies parts of the image by {gain.min():.3g} to {gain.max():.3g}"
-    return f"{spread}, more than a lens does; is r the tangent of the angle to the axis?"
 
 
 NAMES_OF_SEQUENCES = {

@@ -122,8 +122,8 @@ in the dark."""
 MIN_INTERVALS = 3
 """Number of known intervals before one can be unusual."""
 LONGEST_INTERVAL = 10.0
-"""If the first intervals are all longer than so many seconds, the timestamps are hardly in seconds. At 30 frames a second
-milliseconds are 33 apart.
+"""If the first intervals are all longer than so many seconds, the timestamps are hardly in seconds. Milliseconds at 30
+frames a second are 33 apart.
 """
 ROW_STEP = 4
 THUMBNAIL = 5

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.bodies.records import without_moving
-from gavo_jax.camera import Camera, require_camera
+from gavo_jax.camera import Camera
+from gavo_jax.camera_check import require_camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence, require_sequence
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoError, as_number

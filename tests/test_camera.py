@@ -11,16 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gavo_jax.camera import (
-    PRESETS,
-    RIM,
-    Camera,
-    in_image,
-    inverse_depth,
-    preset_for_sequence,
-    require_camera,
-    vignetting_gain,
-)
+from gavo_jax.camera import PRESETS, RIM, Camera, in_image, inverse_depth, preset_for_sequence, vignetting_gain
+from gavo_jax.camera_check import require_camera
 from gavo_jax.camera_files.calibration import load_camera
 from gavo_jax.errors import GavoError
 
@@ -226,6 +218,17 @@ def test_images_of_the_other_byte_order_are_undistorted_alike():
         np.testing.assert_array_equal(undistort(raw.astype(">u2")), undistort(raw.astype("<u2")))
 
 
+def test_images_of_any_numbers_are_undistorted():
+    """What a frame may hold, OpenCV refused with a message of its own."""
+    camera = replace(Camera.preset("fr1"), vignetting=(0.3,))
+    raw = np.random.default_rng(0).integers(0, 256, (480, 640))
+    for undistort in (camera.undistort_depth, camera.undistort_image):
+        right = undistort(raw.astype(np.float32))
+        for kind in (np.int64, np.float16, np.int8):
+            np.testing.assert_array_equal(undistort(raw.astype(kind)), undistort(raw.astype(kind).astype(np.float32)))
+        np.testing.assert_array_equal(undistort(jnp.asarray(raw)), right)
+
+
 def test_a_lens_without_distortion_reaches_everywhere():
     assert Camera(500.0, 500.0, 319.5, 239.5, 640, 480, distortion=()).reach == np.inf
 
@@ -364,6 +367,9 @@ def test_no_camera_file_raises_anything_else(tmp_path_factory, content, suffix):
         ({"distortion": (0.1, 0.2, 0.3)}, "distortion: expected a tuple"),
         ({"distortion": (0.1,) * 5, "model": "fisheye"}, "distortion: expected a tuple of 4 numbers"),
         ({"model": "panorama"}, "model: expected one of pinhole, fisheye"),
+        ({"distortion": (0.26, -0.95, 1.16, -0.005, 0.003)}, "distortion: p1 or p2 is 1.16, .*in this order"),
+        ({"distortion": (100.0, 0.0, 0.0, 0.0)}, "distortion: 9.% of the undistorted image would lie outside"),
+        ({"distortion": (-9.0, 0.0, 0.0, 0.0)}, "distortion: 90% of the undistorted image would lie outside"),
     ],
 )
 def test_a_camera_that_cannot_be_is_refused_before_anything_is_searched(values: dict[str, Any], words: str) -> None:
@@ -413,5 +419,7 @@ def test_images_have_whole_numbers_of_pixels(wrong: Any) -> None:
     for call in (lambda: camera.binned(wrong), lambda: camera.resized(wrong, 60), lambda: camera.resized(80, wrong)):
         with pytest.raises(GavoError, match="expected a whole number of at least 1"):
             call()
+    with pytest.raises(GavoError, match="an image of 160x120 cannot be 128 times smaller"):
+        camera.level(7)
     assert camera.binned(np.int64(2)) == camera.resized(80, 60)  # pyright: ignore[reportArgumentType]
     assert camera.resized(80, 30) == Camera(65.5, 32.75, 39.5, 14.5, 80, 30), "each side by its own factor"

@@ -9,7 +9,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import PRNGKeyArray
 
-from gavo_jax.camera import Camera, require_camera
+from gavo_jax.camera import Camera
+from gavo_jax.camera_check import require_camera
 from gavo_jax.datasets.bars import without_bars
 from gavo_jax.datasets.base import TRACED, Frame, require_grey_levels, require_image
 from gavo_jax.errors import GavoError, shown

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gavo_jax.camera import DISTORTION_COUNTS, MAX_SIDE, MIN_SIDE, PRESETS, Camera, doubt_about_gain
+from gavo_jax.camera import MAX_SIDE, MIN_SIDE, PRESETS, Camera
+from gavo_jax.camera_check import DISTORTION_COUNTS, doubt_about_gain, doubt_about_lens
 from gavo_jax.camera_files.foreign import hint_of_ending
 from gavo_jax.camera_files.makes import PARSERS, PROJECTION, Table
 from gavo_jax.camera_files.words import CAMERA_KEYS, DEVICE_KEYS, MODELS, REQUIRED, model_of
@@ -31,7 +32,7 @@ the numbers are of an image of another size."""
 FAR_OFF = 0.55
 """Share of half a side by which a principal point may be off the middle, as in a cropped image."""
 
-MOST_K1, MOST_TANGENTIAL, MOST_RADIAL = 100.0, 1.0, 1000.0
+MOST_K1, MOST_RADIAL = 100.0, 1000.0
 """Largest of OpenCV's coefficients; what is larger was meant as something else."""
 
 MOST_VIGNETTING = 6
@@ -242,6 +243,8 @@ def camera_from_table(path: Path | str, values: Table, depth_scale: float, part:
     )
     if any(camera.vignetting) and (doubt := doubt_about_gain(camera)):
         raise GavoError(f"{path}: {part}vignetting: {doubt}")
+    if doubt := doubt_about_lens(camera):
+        raise GavoError(f"{path}: {part}distortion: {doubt}")
     return camera
 
 
@@ -278,8 +281,7 @@ def _distortion(path: Path | str, part: str, values: Table) -> tuple[tuple[float
             else "4, 5, 8, 12 or 14 numbers (k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]])"
         )
         raise GavoError(f"{path}: {part}distortion: must be a list of {wanted}, not {_count(numbers)}")
-    tangential = MOST_RADIAL if model == "fisheye" else MOST_TANGENTIAL
-    most = (MOST_K1, MOST_RADIAL, tangential, tangential, *[MOST_RADIAL] * 10)
+    most = (MOST_K1, *[MOST_RADIAL] * 13)
     checked = tuple(
         _number(f"{path}: {part}distortion", value, -limit, limit) for value, limit in zip(numbers, most, strict=False)
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax.camera import DISTORTION_COUNTS
+from gavo_jax.camera_check import DISTORTION_COUNTS
 from gavo_jax.errors import GavoError, shown
 
 Table = dict[str, Any]

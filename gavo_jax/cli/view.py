@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from gavo_jax.camera import Camera, require_camera
+from gavo_jax.camera import Camera
+from gavo_jax.camera_check import require_camera
 from gavo_jax.cli.options import Source, View
 from gavo_jax.cli.readiness import be_ready
 from gavo_jax.cli.selection import open_sequence

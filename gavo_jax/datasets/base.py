@@ -8,7 +8,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float, UInt8
 
-from gavo_jax.camera import Camera, require_camera
+from gavo_jax.camera import Camera
+from gavo_jax.camera_check import require_camera
 from gavo_jax.camera_files.calibration import MOST_DELAY
 from gavo_jax.errors import GavoError, as_number
 from gavo_jax.image.numbers import Depth, is_real

@@ -545,7 +545,9 @@ FAULTS = {
     "a pose.txt": ("1 0 0 2\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "neither a 3x3"),
     "a turn.txt": ("1 0 0\n0 1 0\n0 0 1\n", "cx, cy: 0 0"),
     "size first.txt": ("640 480 500 510 319.5 239.5 0 0\n", "distortion"),
-    "tangential.toml": (TOML + "distortion=[0.1, 0.1, 40, 0]\n", "distortion: must be a number from -1 to 1, not 40"),
+    "tangential.toml": (TOML + "distortion=[0.1, 0.1, 40, 0]\n", "distortion: p1 or p2 is 40, more than a lens has"),
+    "k3 before p1.toml": (TOML + "distortion=[0.1, 0.1, 0.3, 0, 0]\n", "distortion: p1 or p2 is 0.3, more than a"),
+    "pincushion.toml": (TOML + "distortion=[20.0, 0, 0, 0]\n", "of the undistorted image would lie outside"),
     "vignetting of pixels.toml": (
         TOML + "vignetting=[0.9, 90.0]\n",
         "vignetting: multiplies parts of the image by 1 to",

@@ -8,7 +8,8 @@ from typing import NamedTuple, Protocol, Self
 import cv2
 import numpy as np
 
-from gavo_jax.camera import Camera, require_camera
+from gavo_jax.camera import Camera
+from gavo_jax.camera_check import require_camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.images import without_invalid
 from gavo_jax.errors import GavoError

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
-from gavo_jax.camera import Camera, require_camera
+from gavo_jax.camera import Camera
+from gavo_jax.camera_check import require_camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.rendered.actors import builtin_bodies, turn
 from gavo_jax.datasets.rendered.moving import BodyTruth, MovingBody, Scene, body_of_part, build_scene, truths
