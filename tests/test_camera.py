@@ -226,7 +226,7 @@ def test_images_of_any_numbers_are_undistorted():
         right = undistort(raw.astype(np.float32))
         for kind in (np.int64, np.float16, np.int8):
             np.testing.assert_array_equal(undistort(raw.astype(kind)), undistort(raw.astype(kind).astype(np.float32)))
-        np.testing.assert_array_equal(undistort(jnp.asarray(raw)), right)
+        np.testing.assert_array_equal(undistort(jnp.asarray(raw)), right)  # pyright: ignore[reportArgumentType]
 
 
 def test_a_lens_without_distortion_reaches_everywhere():

@@ -189,7 +189,7 @@ def test_missing_files_and_folders_are_refused(tmp_path):
     with pytest.raises(GavoError, match="cannot be written"):
         random_trajectory(2, 0).write_kitti(tmp_path / "folder")
     with pytest.raises(GavoError, match="pose 1 of 2 is not a rigid transform"):
-        Trajectory([0.0, 1.0], [np.eye(4), 2 * np.eye(4)]).write_kitti(tmp_path / "kitti.txt")
+        Trajectory(np.arange(2.0), np.stack([np.eye(4), 2 * np.eye(4)])).write_kitti(tmp_path / "kitti.txt")
     assert not (tmp_path / "kitti.txt").exists()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["folder"]
 
