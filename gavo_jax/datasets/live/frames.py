@@ -138,8 +138,10 @@ class Newest:
         """Yield the newest images each time, waiting for them if there are none yet.
 
         Raises:
-            GavoError: the device failed.
+            GavoError: the device failed, or nothing reads it: this is no `with` block.
         """
+        if self._thread is None:
+            raise GavoError("Newest reads images inside a with block: with gavo.Newest(device) as newest: …")
         while True:
             with self._changed:
                 while self._waiting is None and not self._ended:
@@ -154,6 +156,8 @@ class Newest:
     def _take(self) -> None:
         try:
             while not self._ended and (images := self.device.read()) is not None:
+                if isinstance(images, LiveImages):  # a device may read into the same arrays each time
+                    images = images._replace(color=np.array(images.color), depth=np.array(images.depth))
                 with self._changed:
                     self.received += 1
                     self.dropped += self._waiting is not None

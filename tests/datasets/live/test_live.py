@@ -62,6 +62,33 @@ def test_what_is_not_taken_in_time_makes_room_and_is_counted():
     assert (newest.received, newest.dropped, device.closed) == (5, 3, True)
 
 
+def test_a_device_may_read_into_the_same_arrays():
+    """What was being tracked was overwritten by what came next."""
+    same = images(0)
+
+    class Reusing(StandIn):
+        def read(self):
+            taken = super().read()
+            if taken is not None:
+                np.copyto(same.color, taken.color)
+                taken = taken._replace(color=same.color, depth=same.depth)
+            return taken
+
+    device = Reusing(2)
+    device.allowed.release(1)
+    with Newest(device) as newest:
+        first = next(iter(newest))
+        device.allowed.release(1)
+        while newest.received < 2:
+            time.sleep(0.001)
+        np.testing.assert_array_equal(first.color, images(0).color)
+
+
+def test_without_its_thread_nothing_is_waited_for():
+    with pytest.raises(GavoError, match="inside a with block"):
+        next(iter(Newest(StandIn(1))))
+
+
 @pytest.mark.parametrize("fault", [GavoError("unplugged"), RuntimeError("unplugged")])
 def test_a_devices_fault_is_one_line_after_the_last_frame(fault):
     device = StandIn(1, fault=fault)
