@@ -113,7 +113,7 @@ def look_up(target: Target, warped: Warped, plane: ImagePlane) -> Words:
     """
     pixel = plane.offset + warped.v.astype(jnp.int32) * plane.stride + warped.u.astype(jnp.int32)
     pixel = jnp.where(warped.inside > 0, pixel, 0)
-    words = (channel.reshape(-1).at[pixel].get(mode="promise_in_bounds") for channel in target)
+    words = (jnp.asarray(channel).reshape(-1).at[pixel].get(mode="promise_in_bounds") for channel in target)
     return jax.lax.optimization_barrier(Words(*words))
 
 
