@@ -77,7 +77,7 @@ class SearchOptions:
             help="Settings: the project's own, the paper's, for speed, for large motions. Each of the four methods has "
             "all of them; a method of another package has only default.",
         ),
-    ] = "default"
+    ] = None
     settings: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: the preset's)")] = None
     """Settings from a TOML file or an earlier run's config.json, with the method and preset that it names."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=VALUE", help_behavior_hint="(repeatable)")] = ()

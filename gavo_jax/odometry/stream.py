@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 from gavo_jax.datasets.base import Frame, FrameError, Sequence, require_sequence
 from gavo_jax.datasets.rectified import rectified_at
@@ -36,7 +37,8 @@ def track(
         watch: Called with every `Odometry.frame` and its step, which is None for the first frame.
 
     Raises:
-        GavoError: The input is no sequence or yields something that is no frame, or `odometry` is no driver.
+        GavoError: The input is no sequence or yields something that is no frame, or `odometry` is no driver, or one of
+            another camera (its readout may differ), or has seen more frames than there are.
         FrameError: The first frame cannot be read.
     """
     require_sequence(sequence)
@@ -44,8 +46,14 @@ def track(
         odometry = Odometry(sequence.camera, settings, seed=seed)
     elif not isinstance(odometry, Odometry):
         raise GavoError(f"expected an Odometry, got {type(odometry).__name__}: gavo.Odometry(camera, settings)")
+    elif replace(sequence.camera.rectified(), readout=odometry.camera.readout) != odometry.camera:
+        raise GavoError(f"the driver's camera is not that of {sequence.name}: gavo.Odometry(sequence.camera, settings)")
 
     first = odometry.progress.last_index + 1
+    if first > len(sequence):
+        raise GavoError(
+            f"the driver has seen {first} frames and goes on with the next one, but there are {len(sequence)}"
+        )
     for index, frame in enumerate(decoded(sequence, first), start=first):
         step = odometry.register(frame, float(sequence.timestamps[index]))
         watch(odometry.frame, step)

@@ -775,6 +775,9 @@ def test_a_method_that_the_settings_contradict_is_told(gavo, pristine, tmp_path)
     assert is_refused(gavo(*source, "--preset", "wide"), "--preset wide: ", "says fast")
     assert is_refused(gavo(*source, "--method", "ga"), "--method ga: ", "says gauss-newton"), "though the default"
     assert is_refused(gavo(*source, "--preset", "default"), "--preset default: ", "says fast")
+    done = gavo(*source, "--frames", 3, "--output", tmp_path / "out")
+    assert done.status == 0, done.err
+    assert read_json(tmp_path / "out" / "metrics.json")["preset"] == "fast", "as the file says, though none is given"
 
 
 @pytest.mark.parametrize(

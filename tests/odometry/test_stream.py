@@ -15,7 +15,7 @@ from driving import CAMERA, FRAMES, PLAIN, SEARCH_ALONE, Altered, run, unreadabl
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
-from gavo_jax.odometry.driver import Step
+from gavo_jax.odometry.driver import Odometry, Step
 from gavo_jax.odometry.stream import decoded, track
 
 
@@ -30,6 +30,16 @@ def test_what_is_no_driver_is_refused(sequence: SyntheticSequence) -> None:
     driver: Any = PLAIN
     with pytest.raises(GavoError, match=r"expected an Odometry, got OdometryOptions: gavo\.Odometry\(camera"):
         next(track(sequence, odometry=driver))
+
+
+def test_a_driver_of_another_camera_or_sequence_is_refused(sequence: SyntheticSequence) -> None:
+    """A wrong camera gave wrong poses, and frames of another part of a recording were left out."""
+    with pytest.raises(GavoError, match="the driver's camera is not that of"):
+        next(track(sequence, odometry=Odometry(replace(CAMERA, fx=2 * CAMERA.fx), SEARCH_ALONE)))
+    driver = Odometry(CAMERA, SEARCH_ALONE)
+    assert [step.index for step in track(sequence[:4], odometry=driver)] == [1, 2, 3]
+    with pytest.raises(GavoError, match="has seen 4 frames and goes on with the next one, but there are 3"):
+        next(track(sequence[4:7], odometry=driver))
 
 
 def test_streams(sequence: SyntheticSequence) -> None:
