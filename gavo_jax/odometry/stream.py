@@ -47,7 +47,7 @@ def track(
     elif not isinstance(odometry, Odometry):
         raise GavoError(f"expected an Odometry, got {type(odometry).__name__}: gavo.Odometry(camera, settings)")
     elif replace(sequence.camera.rectified(), readout=odometry.camera.readout) != odometry.camera:
-        raise GavoError(f"the driver's camera is not that of {sequence.name}: gavo.Odometry(sequence.camera, settings)")
+        raise GavoError("the driver's camera is not that of the sequence: gavo.Odometry(sequence.camera, settings)")
 
     first = odometry.progress.last_index + 1
     if first > len(sequence):
