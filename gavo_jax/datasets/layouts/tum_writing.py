@@ -10,8 +10,10 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame, Sequence, require_sequence
+from gavo_jax.datasets.layouts.tum import MAX_DIFFERENCE
 from gavo_jax.datasets.rendered.bodies_truth import MASKS, WithBodies, write_mask, write_truth
 from gavo_jax.errors import GavoError, as_path
+from gavo_jax.trajectory import associate
 
 WRITTEN = ("camera", "__iter__", "name", "ground_truth")
 """Members of `Sequence` that are needed to write it."""
@@ -26,7 +28,7 @@ def write_tum(sequence: Sequence, folder: str | Path) -> None:
 
     Raises:
         GavoError: it is no sequence, the folder already holds one, a file cannot be written, or images are not 8-bit
-            grey and 16-bit depth.
+            grey and 16-bit depth; or a reader would pair other images, as stamps do not increase, or depth is late.
         FrameError: a frame of the sequence cannot be read.
     """
     require_sequence(sequence, WRITTEN)
@@ -46,6 +48,7 @@ def write_tum(sequence: Sequence, folder: str | Path) -> None:
             depth_stamps.append(depth_stamp)
             if bodies:
                 rows += write_mask(cast("WithBodies", sequence), index, frame.timestamp, stamp, folder)
+        _require_pairs(stamps, depth_stamps, folder)
         (folder / "camera.toml").write_text(_camera_toml(sequence.camera), encoding="utf-8")
         if sequence.ground_truth is not None:
             sequence.ground_truth.write_tum(folder / "groundtruth.txt")
@@ -56,6 +59,23 @@ def write_tum(sequence: Sequence, folder: str | Path) -> None:
             (folder / f"{part}.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     except OSError as error:
         raise GavoError(f"{folder}: cannot be written: {error.strerror or error}") from None
+
+
+def _require_pairs(stamps: list[str], depth_stamps: list[str], folder: Path) -> None:
+    """Refuse stamps by which colour and depth would not be read as the pairs that they are.
+
+    Raises:
+        GavoError: names the first pair.
+    """
+    color, depth = np.array(stamps, float), np.array(depth_stamps, float)
+    found = dict(zip(*(indices.tolist() for indices in associate(color, depth, MAX_DIFFERENCE)), strict=True))
+    for index in range(len(stamps)):
+        increase = index == 0 or (color[index] > color[index - 1] and depth[index] > depth[index - 1])
+        if not (increase and found.get(index) == index):
+            own = f"frame {index}, stamps {stamps[index]} and {depth_stamps[index]}"
+            raise GavoError(
+                f"{folder}: {own}: TUM's layout pairs images by increasing stamps, and would lose this pair"
+            )
 
 
 def _write_frame(frame: Frame, folder: Path) -> tuple[str, str]:

@@ -389,6 +389,28 @@ def test_stamps_of_depth_and_the_lens_come_back(tmp_path):
         write_tum(Kinect(np.float32), tmp_path / "f")  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.parametrize(
+    ("stamps", "depth_stamps"),
+    [
+        ([0.0, 0.03, 0.06], [0.01, 0.01, 0.06]),
+        ([0.0, 0.03, 0.06], [0.02, 0.05, 0.08]),
+        ([0.0, 0.0, 0.06], [0.0, 0.0, 0.06]),
+        ([0.0, np.nan, 0.06], [0.0, 0.03, 0.06]),
+    ],
+)
+def test_frames_that_would_be_paired_otherwise_are_not_written(tmp_path, stamps: list, depth_stamps: list):
+    """Half of the frames were lost, or had each other's depth."""
+
+    class Stamped(Kinect):
+        def __iter__(self):
+            for frame, *own in zip(SyntheticSequence(frames=3, camera=SMALL), stamps, depth_stamps, strict=True):
+                yield replace(frame, timestamp=own[0], depth_timestamp=own[1])
+
+    with pytest.raises(GavoError, match="frame [01], stamps .*would lose this pair"):
+        write_tum(Stamped(), tmp_path / "k")  # pyright: ignore[reportArgumentType]
+    assert not (tmp_path / "k" / "rgb.txt").exists()
+
+
 @pytest.mark.parametrize("other", [None, "fr1_xyz", [], SyntheticSequence])
 def test_what_is_no_sequence_is_not_written(tmp_path, other):
     with pytest.raises(GavoError, match="expected a Sequence, got"):
