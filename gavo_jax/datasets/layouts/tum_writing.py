@@ -68,14 +68,13 @@ def _require_pairs(stamps: list[str], depth_stamps: list[str], folder: Path) -> 
         GavoError: names the first pair.
     """
     color, depth = np.array(stamps, float), np.array(depth_stamps, float)
-    found = dict(zip(*(indices.tolist() for indices in associate(color, depth, MAX_DIFFERENCE)), strict=True))
-    for index in range(len(stamps)):
-        increase = index == 0 or (color[index] > color[index - 1] and depth[index] > depth[index - 1])
-        if not (increase and found.get(index) == index):
-            own = f"frame {index}, stamps {stamps[index]} and {depth_stamps[index]}"
-            raise GavoError(
-                f"{folder}: {own}: TUM's layout pairs images by increasing stamps, and would lose this pair"
-            )
+    of_color, of_depth = associate(color, depth, MAX_DIFFERENCE)
+    is_read = np.isin(np.arange(len(color)), of_color[of_color == of_depth])
+    is_read[1:] &= (np.diff(color) > 0) & (np.diff(depth) > 0)
+    if not is_read.all():
+        index = int(np.argmin(is_read))
+        own = f"frame {index}, stamps {stamps[index]} and {depth_stamps[index]}"
+        raise GavoError(f"{folder}: {own}: TUM's layout pairs images by increasing stamps, and would lose this pair")
 
 
 def _write_frame(frame: Frame, folder: Path) -> tuple[str, str]:
