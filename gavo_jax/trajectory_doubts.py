@@ -1,4 +1,4 @@
-"""Why a trajectory may disagree with another as a whole: the order of its quaternions, inverse poses, or its size."""
+"""Why a trajectory may disagree with another as a whole: the order of its quaternions, inverse poses, axes, or size."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gavo_jax.errors import GavoError
-from gavo_jax.evaluation import align_rigidly, relative_pose_error
+from gavo_jax.evaluation import align_rigidly, relative_pose_error, rotation_angle
 from gavo_jax.trajectory import Trajectory, inverse, quaternion_from_rotation, rotation_from_quaternion
 
 REORDERED, LARGE = 0.25, 2.0
@@ -15,6 +15,12 @@ second, and that error exceeds this many degrees."""
 
 FAR = 0.02
 """Metres: the same for translations, where poses are taken to be inverted."""
+
+TURNED = 0.2
+"""Radians by which a camera's axes are turned at least, where they are taken to be other ones."""
+
+ALONG = 0.97
+"""Cosine above which an axis is taken to lie along another one."""
 
 OTHER_SIZE = 1.15
 """Ratio of two sizes above which they differ."""
@@ -34,21 +40,24 @@ def is_w_first(trajectory: Trajectory, other: Trajectory) -> bool:
     """Whether a file has its quaternions as w x y z instead of x y z w, judged by another trajectory.
 
     The file alone does not show it: the wrong order leaves motions as large and as smooth. But two trajectories that
-    disagree, and agree once this one is reordered, do. Misread quaternions are the inverse rotations between two fixed
-    ones, so inverse poses of a camera that turns about one axis look alike; those are not reported.
+    disagree, and agree once this one is reordered, do; their translations then agree no worse. Misread quaternions are
+    the inverse rotations between two fixed ones, so inverse poses of a camera that turns about one axis look alike;
+    those are not reported.
     """
 
-    def error(quaternions: Float[np.ndarray, "n 4"]) -> float:
+    def errors(quaternions: Float[np.ndarray, "n 4"]) -> tuple[float, float]:
         poses = trajectory.world_T_camera.copy()
         poses[:, :3, :3] = rotation_from_quaternion(quaternions)
-        return relative_pose_error(other, replace(trajectory, world_T_camera=poses)).rotation.median
+        return _errors(other, trajectory, poses)
 
     quaternions = quaternion_from_rotation(trajectory.world_T_camera[:, :3, :3])
     try:
-        least = min(error(quaternions), error(quaternions * [-1, -1, -1, 1]))
-        return least > LARGE and error(quaternions[:, [1, 2, 3, 0]]) < REORDERED * least
+        moved, turned = errors(quaternions)
+        least = min(turned, errors(quaternions * [-1, -1, -1, 1])[1])
+        reordered = errors(quaternions[:, [1, 2, 3, 0]])
     except GavoError:
         return False
+    return least > LARGE and reordered[1] < REORDERED * least and reordered[0] < max(moved, FAR)
 
 
 def is_inverse(trajectory: Trajectory, other: Trajectory) -> bool:
@@ -56,19 +65,69 @@ def is_inverse(trajectory: Trajectory, other: Trajectory) -> bool:
 
     Their motions disagree, and agree once this one's poses are inverted; their rotations then agree no worse.
     """
-
-    def errors(poses: Float[np.ndarray, "n 4 4"]) -> np.ndarray:
-        relative = relative_pose_error(other, replace(trajectory, world_T_camera=poses))
-        return np.array([relative.translation.median, relative.rotation.median])
-
     try:
-        as_written = errors(trajectory.world_T_camera)
+        as_written = _errors(other, trajectory, trajectory.world_T_camera)
         if not as_written[0] > FAR:
             return False
-        inverted = errors(inverse(trajectory.world_T_camera))
+        inverted = _errors(other, trajectory, inverse(trajectory.world_T_camera))
     except GavoError:
         return False
-    return bool(inverted[0] < REORDERED * as_written[0] and inverted[1] < max(as_written[1], LARGE))
+    return inverted[0] < REORDERED * as_written[0] and inverted[1] < max(as_written[1], LARGE)
+
+
+def other_axes(trajectory: Trajectory, other: Trajectory) -> str | None:
+    """Say how a trajectory's camera axes lie in the other's if the two differ in nothing else; None if they do not.
+
+    The absolute error does not show it, as it compares positions. But a motion is given in the camera's axes, so that
+    the same motion is another one in other axes: both its translation and its rotation are turned.
+    """
+    try:
+        as_written = _errors(other, trajectory, trajectory.world_T_camera)
+        own, others = _twists(trajectory, other)
+        if len(own) < FEWEST_POSES or not (as_written[0] > FAR or as_written[1] > LARGE):
+            return None
+        # a motion and its inverse: their centre is zero, so that a turn alone is left
+        rotation, _ = align_rigidly(np.concatenate([own, -own]), np.concatenate([others, -others]))
+        poses = trajectory.world_T_camera.copy()
+        poses[:, :3, :3] = poses[:, :3, :3] @ rotation.T
+        turned = _errors(other, trajectory, poses)
+    except GavoError:
+        return None
+    limits = zip(turned, as_written, (FAR, LARGE), strict=True)
+    is_told = all(after < max(REORDERED * before, least) for after, before, least in limits)
+    angle = float(rotation_angle(rotation))
+    return _axes(rotation, angle) if is_told and angle > TURNED else None
+
+
+def _axes(rotation: Float[np.ndarray, "3 3"], angle: float) -> str:
+    """Words for the axes of a camera, the columns of a rotation; other ones than the other camera's are named."""
+    largest = np.abs(rotation).argmax(axis=0)
+    signs = np.sign(rotation[largest, range(3)])
+    if np.abs(rotation).max(axis=0).min() < ALONG:
+        return f"its camera is turned by {np.degrees(angle):.0f}° against the other's"
+    names = ", ".join(f"{'-' if sign < 0 else ''}{'xyz'[axis]}" for sign, axis in zip(signs, largest, strict=True))
+    return f"its camera's x, y, z axes are the other's {names}"
+
+
+def _errors(estimate: Trajectory, truth: Trajectory, poses: Float[np.ndarray, "n 4 4"]) -> tuple[float, float]:
+    """Median relative errors over one second, metres and degrees, if the truth had other poses."""
+    relative = relative_pose_error(estimate, replace(truth, world_T_camera=poses))
+    return relative.translation.median, relative.rotation.median
+
+
+def _twists(trajectory: Trajectory, other: Trajectory) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
+    """Translations and turns of both over one second from where either has poses; turns in units of translations."""
+    starts = trajectory.timestamps
+    ends = [[one.interpolate(starts + later) for later in (0.0, 1.0)] for one in (trajectory, other)]
+    known = np.all([valid & np.isfinite(pose).all(axis=(1, 2)) for own in ends for pose, valid in own], axis=0)
+    motions = [inverse(start[known]) @ end[known] for (start, _), (end, _) in ends]
+    moved = [motion[:, :3, 3] for motion in motions]
+    rotations = [motion[:, :3, :3] for motion in motions]
+    skew = [rotation - rotation.swapaxes(1, 2) for rotation in rotations]
+    turned = [one[:, [2, 0, 1], [1, 2, 0]] / 2 for one in skew]  # axis times sine
+    weight = np.linalg.norm(moved[1]) / max(float(np.linalg.norm(turned[1])), np.finfo(float).tiny)
+    own, others = (np.concatenate([one, weight * turn]) for one, turn in zip(moved, turned, strict=True))
+    return own, others
 
 
 def unit_of_length(size: float) -> str | None:

@@ -24,7 +24,7 @@ from gavo_jax.output.drawing import draw
 from gavo_jax.output.files import COMPARISON, FRAMES, prepare_folder, refuse_foreign
 from gavo_jax.output.screen import number, print_table, say, waiting
 from gavo_jax.trajectory import MAX_GAP, Trajectory, associate
-from gavo_jax.trajectory_doubts import is_inverse, is_w_first, relative_size, unit_of_length
+from gavo_jax.trajectory_doubts import is_inverse, is_w_first, other_axes, relative_size, unit_of_length
 
 UNITS = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
 """Units, in seconds, that timestamps may have instead of seconds."""
@@ -81,6 +81,8 @@ def _remarks(paths: tuple[Path, Path], read: list[tuple[Trajectory, float]]) -> 
         elif is_inverse(one, other):
             yield f"{path}: it agrees only if its poses are inverted; write them from camera to world"
             are_comparable = False
+    if are_comparable and (axes := other_axes(read[0][0], read[1][0])):
+        yield f"{paths[0]}: it agrees with {paths[1]} only if {axes}; the relative errors do not allow for that"
     if are_comparable and (size := relative_size(read[0][0], read[1][0])):
         cause = "the errors do not allow for that"
         for path, times in zip(paths, (size, 1 / size), strict=True):

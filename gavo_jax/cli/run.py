@@ -46,7 +46,7 @@ from gavo_jax.output.trajectories import formats, remove_trajectories, write_tra
 from gavo_jax.settings import Settings
 from gavo_jax.settings_check import as_seed
 from gavo_jax.trajectory import Trajectory
-from gavo_jax.trajectory_doubts import is_inverse, is_w_first, relative_size, unit_of_length
+from gavo_jax.trajectory_doubts import is_inverse, is_w_first, other_axes, relative_size, unit_of_length
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
 
@@ -140,6 +140,8 @@ def _doubts(trajectory: Trajectory, truth: Trajectory, units: float) -> Iterator
     elif is_inverse(truth, trajectory):
         yield "The ground truth agrees only if its poses are inverted; write them from camera to world."
         return
+    if axes := other_axes(truth, trajectory):
+        yield f"The ground truth agrees only if {axes}; write it for a camera with x right, y down and z forward."
     if size := relative_size(trajectory, truth):
         unit = f"{size * units:.4g} units per metre (--depth-scale), not {units:g}"
         cause = f"It would agree if depth had {unit}."

@@ -572,14 +572,19 @@ def test_evaluate_tells_quaternions_of_the_other_order(gavo, tmp_path):
     assert words not in gavo("evaluate", tmp_path / "right", tmp_path / "right").out
 
 
-def test_a_truth_of_inverse_poses_or_in_millimetres_is_told(gavo, pristine, tmp_path):
-    """Of one in millimetres it was said that depth had 5 units per metre, which was then refused."""
+def test_a_truth_of_inverse_poses_in_other_axes_or_in_millimetres_is_told(gavo, pristine, tmp_path):
+    """Of one in millimetres it was said that depth had 5 units per metre, which was refused; of other axes nothing."""
     source, camera = tmp_path / "source", ("--camera", pristine / "camera.toml")
     shutil.copytree(pristine, source)
     truth = Trajectory.read_tum(pristine / "groundtruth.txt")
     large = truth.world_T_camera * np.array([1, 1, 1, 1e3])
     large[:, 3, 3] = 1.0
-    for poses, words in ((inverse(truth.world_T_camera), "poses are inverted"), (large, "in millimetres")):
+    in_opengl = truth.world_T_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
+    for poses, words in (
+        (inverse(truth.world_T_camera), "poses are inverted"),
+        (large, "in millimetres"),
+        (in_opengl, "x, y, z axes are the other's x, -y, -z"),
+    ):
         replace(truth, world_T_camera=poses).write_tum(source / "groundtruth.txt")
         done = gavo("run", source, *camera, "--output", tmp_path / "out", *FAST)
         assert done.status == 0 and words in done.out and "units per metre (--depth-scale)" not in done.out, done.out
