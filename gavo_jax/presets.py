@@ -106,7 +106,7 @@ WIDE_OBJECTIVE = AlignmentOptions(
     features="both",
     points=19200,
     estimation_points=None,
-    depth_weight=(0.3, 0.3, 1.0, 0.3, 0.3),
+    depth_weight=(0.1, 0.1, 1.0, 0.3, 0.3),
     doubt_depth=True,
     islands=(1, 1, 1, 16, 96),
     scouts=8192,
@@ -119,8 +119,8 @@ WIDE_OBJECTIVE = AlignmentOptions(
 most evidence go on to level 3 and 4 are refined, beside the motions that a single pair's features suggest. A point out
 of view costs as much as a typical one in view, so that leaving the view is neither rewarded nor punished. Exposure
 changes over such motions, so residuals are taken about their mean. Close to a mode grey alone separates motions badly,
-so depth counts as much; at the finest levels, which decide the accuracy, less. Over a wide baseline one frame may be
-blurred and each sees what the other doesn't, so both directions count, on more points than in tracking."""
+so depth counts as much; at the finest levels, which decide the accuracy, a tenth of that. Over a wide baseline one
+frame may be blurred and each sees what the other doesn't, so both directions count, on more points than in tracking."""
 
 
 _registered: dict[str, Settings] = {}

@@ -50,8 +50,8 @@ class AlignmentOptions:
             have wrong depth residuals (static); see `objective.estimates.depth_trust`.
         last_step: Whether the motion that the search ends with takes one more Newton step, with the gradient and
             Hessian of E that also give its covariance (static); Le Cam's one-step estimate. Sampled candidates end
-            scattered about the minimum; this centres them. More steps follow while E falls. Not done where the error is
-            `symmetric`: the derivatives cover one direction only.
+            scattered about the minimum; this centres them. More steps follow while E falls. Where the error is
+            `symmetric`, only a sequence's sway is refined: the derivatives cover one direction only.
         min_overlap: Share of the reference's points that a candidate must keep in view to count.
         outside_cost: Cost of a point that leaves the view on levels where several islands compete; see `Objective`.
             Where it is None, and on levels that refine a single motion, such a point does not count: the paper's error.

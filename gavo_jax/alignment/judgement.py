@@ -103,8 +103,8 @@ def conclude(
     centre = winner.motion if winner.centre is None else winner.centre
     problem = Problem(objective=objective, origin=winner.motion, basis=jnp.eye(6), centre=centre, reach=reach)
     added = jnp.zeros((6, 6))
-    if options.last_step and not options.symmetric:
-        problem, residuals, added = _last_step(problem, residuals, swaying, points)
+    if options.last_step:
+        problem, residuals, added = _last_step(problem, residuals, swaying, points, is_symmetric=options.symmetric)
         objective = problem.objective
     motion = problem.origin
     examination, covariance, chosen_by = _weigh(_examine(problem, residuals, part), objective, winner.judge, added)
@@ -132,15 +132,19 @@ def conclude(
 
 
 def _last_step(
-    problem: Problem, residuals: Residuals, swaying: Swaying | None, points: Integer[Array, ""]
+    problem: Problem, residuals: Residuals, swaying: Swaying | None, points: Integer[Array, ""], *, is_symmetric: bool
 ) -> tuple[Problem, Residuals, Float[Array, "6 6"]]:
     """Refine the motion and, under a rolling shutter, the target's sway.
+
+    A motion of the symmetric error is refined only for the sake of the sway: the derivatives cover one direction.
 
     Returns:
         The problem about the refined motion, its residuals, and the sway's contribution to the covariance.
     """
 
     def without_sway() -> Swayed:
+        if is_symmetric:
+            return unswayed(problem.origin, residuals)
         return unswayed(*_newton_steps(problem, residuals))
 
     if swaying is None or problem.objective.readout is None:
