@@ -81,6 +81,8 @@ def _follow(options: Run, device: LiveDevice, settings: Settings, shape: Shape) 
             "frames_dropped": newest.dropped,
         }
         folder.finish(metrics)
+        if steps[-1].lost and settings.odometry.on_lost == "stop":
+            say(f"{folder.path}: the run ended at its first lost pair")
         print_run(name, metrics, folder.path, trajectory, truth=None)
         write_trajectories(trajectory, folder.path, formats(options.trajectory_format))
         if options.map is not None and scene is not None:

@@ -26,7 +26,7 @@ from gavo_jax.datasets.depth_unit import doubt_of_guess, first_depths, unit_of_f
 from gavo_jax.datasets.live.devices import is_live
 from gavo_jax.datasets.selection import SYNTHETIC
 from gavo_jax.early import INTERRUPTED, LOST
-from gavo_jax.errors import print_message
+from gavo_jax.errors import GavoError, print_message
 from gavo_jax.inspection import left_out, left_out_in_short, summary
 from gavo_jax.interrupts import interruptible
 from gavo_jax.mapping.background import BackgroundMapper, mapper_of
@@ -37,7 +37,7 @@ from gavo_jax.odometry.metrics import run_identity
 from gavo_jax.odometry.progress import Progress
 from gavo_jax.odometry.run import finish_run
 from gavo_jax.output.drawing import draw, draw_search
-from gavo_jax.output.files import FIGURE_NAMES, ODOMETRY, RECORDING, TRAJECTORY, circumstances
+from gavo_jax.output.files import FIGURE_FORMATS, ODOMETRY, RECORDING, TRAJECTORY, circumstances
 from gavo_jax.output.loops import write_loops
 from gavo_jax.output.run_folder import RunFolder
 from gavo_jax.output.screen import say, waiting
@@ -85,8 +85,7 @@ def run(options: Run) -> int:
         metrics, interrupted = folder.finished() if options.resume else None, False
         if metrics is not None:
             shown = "" if options.viewer == "none" else f"; gavo view {folder.path} shows it"
-            ended = "is already complete" if metrics.get("complete", True) else "ended at its first lost pair"
-            print_message(f"{folder.path}: the run {ended}: nothing to resume{shown}")
+            print_message(f"{folder.path}: the run {_end(metrics, folder)}: nothing to resume{shown}")
             _draw_if_missing(options, sequence, folder)
         else:
             # before an earlier run is replaced, as opening may fail
@@ -99,6 +98,8 @@ def run(options: Run) -> int:
             for line in _remarks(options, sequence):
                 say(line)
             metrics, interrupted = _track(name, options, sequence, odometry, folder, viewer, mapper)
+        if not (metrics.get("complete", True) or interrupted):
+            say(f"{folder.path}: the run ended at its first lost pair: {metrics['frames']} of {len(sequence)} frames")
         trajectory = Trajectory.read_tum(folder.path / TRAJECTORY)
         truth, is_rendered = sequence.ground_truth, options.sequence == SYNTHETIC
         print_run(name, metrics, folder.path, trajectory, truth=truth, is_rendered=is_rendered)
@@ -114,6 +115,19 @@ def run(options: Run) -> int:
         return INTERRUPTED
     viewer.stay()
     return LOST if options.strict and metrics["lost_pairs"] else 0
+
+
+def _end(metrics: dict[str, Any], folder: RunFolder) -> str:
+    """Say how an earlier run without a checkpoint ended.
+
+    Raises:
+        GavoError: It was interrupted, and its checkpoint is gone.
+    """
+    if metrics.get("complete", True):
+        return "is already complete"
+    if metrics.get("lost_pairs"):
+        return "ended at its first lost pair"
+    raise GavoError(f"{folder.path}: the run was interrupted, and its checkpoint is gone: run again without --resume")
 
 
 def _remarks(options: Run, sequence: Sequence) -> Iterator[str]:
@@ -251,8 +265,12 @@ def _track(
         _draw(options.base[0], folder, outcome.trajectory, outcome.odometry, sequence.ground_truth)
         draw_search(folder.path, sequence, odometry, revised(tracked.steps))
 
-    with waiting("drawing figures …"):
-        interruptible(draw_figures)
+    try:
+        with waiting("drawing figures …"):
+            interruptible(draw_figures)
+    except KeyboardInterrupt:
+        say("Run the same command with --resume to draw the figures of the trajectory.")
+        raise
     return metrics, tracked.interrupted
 
 
@@ -267,8 +285,9 @@ def _draw(
 
 
 def _draw_if_missing(options: Run, sequence: Sequence, folder: RunFolder) -> None:
-    """Draw the trajectory of a complete run that was interrupted before it had figures."""
-    if any((folder.path / name).exists() for name in FIGURE_NAMES):
+    """Draw the trajectory of a complete run that was interrupted before it had all figures of it."""
+    drawn = ("trajectory",) if sequence.ground_truth is None else ("trajectory", "distance_error")
+    if all((folder.path / f"{name}.{suffix}").exists() for name in drawn for suffix in FIGURE_FORMATS):
         return
     trajectory, odometry = (
         Trajectory.read_tum(path) if (path := folder.path / name).exists() else None for name in (TRAJECTORY, ODOMETRY)

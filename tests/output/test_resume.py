@@ -344,10 +344,22 @@ def test_images_that_changed_are_noticed(clip, tmp_path, monkeypatch, capsys, un
 def test_a_run_that_ended_at_a_lost_pair_says_so(clip, tmp_path, capsys, undrawn):
     """It was told that the images had changed: those of all frames were compared with those that it had seen."""
     assert main(arguments(clip, tmp_path / "out", "--on-lost", "stop")) == 0
-    assert not json.loads((tmp_path / "out" / "metrics.json").read_text())["complete"]
-    capsys.readouterr()
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert not metrics["complete"]
+    assert f"ended at its first lost pair: {metrics['frames']} of 40 frames" in capsys.readouterr().out
     assert main(arguments(clip, tmp_path / "out", "--on-lost", "stop", "--resume")) == 0
     assert "the run ended at its first lost pair: nothing to resume" in capsys.readouterr().err
+
+
+def test_an_interrupted_run_whose_checkpoint_is_gone_is_no_finished_one(clip, tmp_path, capsys, undrawn):
+    """It was said to have ended at a lost pair."""
+    assert main(arguments(clip, tmp_path / "out")) == 0
+    path = tmp_path / "out" / "metrics.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "complete": False, "lost_pairs": 0}))
+    capsys.readouterr()
+    assert main(arguments(clip, tmp_path / "out", "--resume")) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "its checkpoint is gone: run again without --resume" in error
 
 
 def test_a_finished_run_that_nothing_tells_of_is_not_shown_for_another(whole, clip, tmp_path, capsys):
@@ -392,7 +404,7 @@ def test_ctrl_c_in_the_last_row_leaves_the_row_and_the_figures(clip, whole, tmp_
     assert {path.name for path in (tmp_path / "out").iterdir()} == {path.name for path in whole.iterdir()}
 
 
-def test_figures_that_were_interrupted_are_drawn_later(clip, tmp_path, monkeypatch):
+def test_figures_that_were_interrupted_are_drawn_later(clip, tmp_path, monkeypatch, capsys):
     def stop(*arguments: Any) -> None:
         raise KeyboardInterrupt
 
@@ -400,8 +412,13 @@ def test_figures_that_were_interrupted_are_drawn_later(clip, tmp_path, monkeypat
         patch.setattr(run, "draw", stop)
         assert main(arguments(clip, tmp_path / "out")) == 130
     assert not list((tmp_path / "out").glob("*.png"))
+    assert "--resume to draw the figures" in capsys.readouterr().out
     assert main(arguments(clip, tmp_path / "out", "--resume")) == 0
     assert (tmp_path / "out" / "trajectory.png").exists() and (tmp_path / "out" / "distance_error.png").exists()
+    for name in ("distance_error.svg", "trajectory.png"):  # as if killed between two of them
+        (tmp_path / "out" / name).unlink()
+        assert main(arguments(clip, tmp_path / "out", "--resume")) == 0
+        assert (tmp_path / "out" / name).exists()
 
 
 def test_metrics_are_there_before_the_figures(clip, tmp_path, monkeypatch, capsys):
