@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from gavo_jax.errors import GavoError, as_path, partial_of, shown
 from gavo_jax.output.files import TRAJECTORY, json_text, remove_files
+from gavo_jax.output.screen import say
 from gavo_jax.trajectory import Trajectory, quaternion_from_rotation, require_trajectory, write_lines
 
 FILES = {
@@ -21,6 +22,9 @@ FILES = {
     "bag": "trajectory_bag",
 }
 """Name of each format's file in a run's folder; the bag is a folder, as usual in ROS 2."""
+
+SHOWING_SEGMENTS = ("tum", "json")
+"""Formats that tell the segments of a trajectory."""
 
 EUROC_HEADER = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
 
@@ -89,12 +93,16 @@ def formats(text: str) -> list[str]:
 def write_trajectories(trajectory: Trajectory, folder: Path, forms: Iterable[str]) -> None:
     """Write a run's trajectory in some formats, except TUM, which every run writes as it goes.
 
+    A line on screen names those that do not show where the motion is unknown.
+
     Raises:
         GavoError: See `write_trajectory`.
     """
     for form in forms:
         if form != "tum":
             write_trajectory(trajectory, folder / FILES[form], form)
+    if trajectory.segments.any() and (blind := [FILES[form] for form in forms if form not in SHOWING_SEGMENTS]):
+        say(f"{', '.join(blind)}: not shown there: the motion between the segments of {TRAJECTORY} is unknown")
 
 
 def remove_trajectories(folder: Path) -> None:

@@ -10,7 +10,14 @@ from evo.tools import file_interface
 from rosbags.highlevel import AnyReader
 
 from gavo_jax.errors import GavoError
-from gavo_jax.output.trajectories import FILES, POSES, formats, remove_trajectories, write_trajectory
+from gavo_jax.output.trajectories import (
+    FILES,
+    POSES,
+    formats,
+    remove_trajectories,
+    write_trajectories,
+    write_trajectory,
+)
 from gavo_jax.se3 import exp
 from gavo_jax.trajectory import Trajectory
 
@@ -59,6 +66,14 @@ def test_json_holds_every_digit_and_the_segments(tmp_path):
     assert [pose["timestamp"] for pose in poses] == STAMPS.tolist()
     np.testing.assert_array_equal([pose["translation"] for pose in poses], TRAJECTORY.world_T_camera[:, :3, 3])
     assert [pose["segment"] for pose in poses] == [0, 0, 1, 1]
+
+
+def test_formats_that_do_not_show_breaks_are_named(tmp_path, capsys):
+    write_trajectories(TRAJECTORY, tmp_path, ["tum", "json", "kitti", "euroc"])
+    assert "trajectory.kitti.txt, trajectory.csv: not shown there" in capsys.readouterr().out
+    for trajectory, form in ((TRAJECTORY, "json"), (TRAJECTORY[:2], "kitti")):
+        write_trajectories(trajectory, tmp_path, [form])
+    assert not capsys.readouterr().out
 
 
 def test_bag_holds_the_poses_and_is_replaced(tmp_path):
