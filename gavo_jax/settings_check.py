@@ -141,7 +141,7 @@ def _kind(kind: Any, default: Any) -> tuple[str, Callable[[Any], bool]]:
 
         return f"a list of {count} {'whole ' if whole else ''}numbers", fits
     if origin is Literal:
-        return f"one of {', '.join(parts)}", lambda value: value in parts
+        return f"one of {', '.join(parts)}", lambda value: isinstance(value, str) and value in parts
     if origin is Callable:
         return "a function", callable
     return "", lambda value: True

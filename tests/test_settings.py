@@ -86,6 +86,12 @@ def test_old_names_still_work_and_warn(old, new):
         ("alignment", "loss", "huber", "alignment.loss: must be a function, not 'huber'"),
         ("alignment", "bounds", (0.1, 0.2, 0.3), "alignment.bounds: must be a list of 2 numbers"),
         ("alignment", "min_overlap", float("nan"), "alignment.min_overlap: must be a number, not nan"),
+        (
+            "odometry",
+            "bodies",
+            np.array(["off", "mask"]),
+            "odometry.bodies: must be one of off, mask, track, not array",
+        ),
         ("odometry", "bodies", True, "odometry.bodies: must be one of off, mask, track, not True"),
     ],
 )

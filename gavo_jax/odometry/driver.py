@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float64
 
 from gavo_jax.alignment.result import Alignment, no_alignment, with_finding
 from gavo_jax.alignment.search import Population
+from gavo_jax.alignment.stacking import require_untraced
 from gavo_jax.bodies.records import Body, covered, in_world
 from gavo_jax.camera import Camera
 from gavo_jax.camera_check import require_camera
@@ -164,7 +165,7 @@ class Odometry:
         frame: The last frame as it was tracked, without overlays. None where it could not be read.
 
     Raises:
-        GavoError: The camera's images are too small, or the seed is invalid.
+        GavoError: The camera's images are too small, the seed is invalid, or it is made inside `jax.jit`.
     """
 
     @in_32_bits
@@ -179,6 +180,7 @@ class Odometry:
         aligner: Aligner | None = None,
         relocaliser: Relocaliser | None = None,
     ):
+        require_untraced(camera, settings, solver)
         require_camera(camera)
         self.relocaliser = relocaliser
         self.recorded, self.camera, self.settings = camera, camera.rectified(), as_settings(settings, solver)

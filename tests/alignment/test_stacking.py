@@ -18,6 +18,7 @@ from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.rendered.synthetic import SyntheticSequence
 from gavo_jax.errors import GavoError
 from gavo_jax.odometry.driver import Odometry
+from gavo_jax.odometry.run import run_odometry
 from gavo_jax.settings import AlignmentOptions, Settings
 
 
@@ -121,6 +122,7 @@ def test_a_traced_call_is_told(small_frames: dict[int, Frame]) -> None:
         lambda: jax.vmap(lambda grey: align(Frame(grey, depth, 0.0), second, CAMERA, NEWTON).error)(grey[None]),  # pyright: ignore
         lambda: jax.grad(lambda guess: align(first, second, CAMERA, NEWTON, guess=guess).error)(jnp.eye(4)),
         lambda: jax.grad(lambda fx: align(first, second, replace(CAMERA, fx=fx), NEWTON).error)(131.0),
+        lambda: jax.jit(lambda x: x + len(run_odometry(SyntheticSequence(2, camera=CAMERA), NEWTON).steps))(1.0),
         lambda: jax.jit(lambda grey: align_batch((grey, depth[None]), [second], CAMERA, NEWTON).error)(grey[None]),
     ):
         with pytest.raises(GavoError, match="outside jax.jit, jax.vmap and jax.grad"):
