@@ -12,15 +12,13 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8, UInt16
 
 from gavo_jax.errors import GavoError
+from gavo_jax.number_types import as_array
 
 MIN_SIDE, MAX_SIDE = 16, 8192
 """Smallest and largest image width or height accepted, in pixels: the coarsest of five levels is 16 times smaller."""
 
 RIM = 4
 """Undistortion drops depth readings within this many pixels of the raw image's border."""
-
-OPENCV = (np.uint8, np.uint16, np.int16, np.float32, np.float64)
-"""Types of the images that OpenCV undistorts."""
 
 OFF_AXIS = 10.0, 10001
 """Largest x / z at which a lens is examined (84° off axis), and the number of samples up to there."""
@@ -189,7 +187,7 @@ class Camera:
         if self.is_rectified:
             return image
         self._check_size(image)
-        image = _for_opencv(image)
+        image = as_array(image)
         if self.is_distorted:
             coordinates, fractions, _ = undistortion_maps(self.on_host())
             image = cv2.remap(image, coordinates, fractions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -211,7 +209,7 @@ class Camera:
         if not self.is_distorted:
             return depth
         self._check_size(depth)
-        depth = _for_opencv(depth)
+        depth = as_array(depth)
         _, _, nearest = undistortion_maps(self.on_host())
         none = np.empty(0, np.float32)
         return cv2.remap(depth, nearest, none, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
@@ -274,13 +272,6 @@ def _require_counts(**counts: Any) -> None:
     for name, value in counts.items():
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
             raise GavoError(f"{name}: expected a whole number of at least 1, got {value!r}")
-
-
-def _for_opencv(image: Any) -> np.ndarray:
-    """An image as a plain array in the machine's byte order; numbers that OpenCV does not know become float32."""
-    image = np.asarray(image)
-    native = image.dtype.newbyteorder("=")
-    return image.astype(native if native in OPENCV else np.float32, copy=False)
 
 
 def _stack(*arrays: Any) -> Any:

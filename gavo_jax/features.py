@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
 from gavo_jax.camera import Camera
-from gavo_jax.image.numbers import Depth, grey_bytes
+from gavo_jax.number_types import Depth, grey_bytes
 
 FeatureKind = Literal["sift", "orb"]
 

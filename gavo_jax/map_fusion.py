@@ -17,9 +17,9 @@ from gavo_jax.camera_check import require_camera
 from gavo_jax.datasets.base import Frame, FrameError, Sequence, require_sequence
 from gavo_jax.datasets.rectified import rectified
 from gavo_jax.errors import GavoError, as_number
-from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.libusb import import_open3d
 from gavo_jax.map_blocks import BLOCK, MOST_BLOCKS, image_for_blocks
+from gavo_jax.number_types import grey_bytes
 from gavo_jax.odometry.driver import Moving, Step, seen_moving
 from gavo_jax.odometry.overlays import AsTracked
 from gavo_jax.scene_map import FARTHEST, VOXEL, SceneMap, Shape, check_shape, check_voxel

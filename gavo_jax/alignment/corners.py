@@ -12,7 +12,7 @@ from jaxtyping import Float, Float64, UInt8
 
 from gavo_jax.camera import Camera, to_ray
 from gavo_jax.image.motion_compensation import filled_inverse_depth
-from gavo_jax.image.numbers import Depth, grey_bytes
+from gavo_jax.number_types import Depth, grey_bytes
 
 MAX_CORNERS = 500
 """Largest number of corners of a frame; the strongest are kept."""

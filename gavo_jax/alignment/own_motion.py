@@ -17,8 +17,8 @@ from gavo_jax.alignment.corners import track_corners
 from gavo_jax.alignment.result import MAX_ROTATION_DEVIATION, MAX_TRANSLATION_DEVIATION, Alignment
 from gavo_jax.camera import Camera, to_pixels, to_ray
 from gavo_jax.image.motion_compensation import filled_inverse_depth, pixel_flow
-from gavo_jax.image.numbers import Depth
 from gavo_jax.image.shutter import row_time
+from gavo_jax.number_types import Depth
 from gavo_jax.se3 import log
 from gavo_jax.status import AlignmentStatus, bit, gravest
 from gavo_jax.trajectory import inverse

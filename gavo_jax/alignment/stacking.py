@@ -14,7 +14,7 @@ from gavo_jax.camera_check import require_camera
 from gavo_jax.datasets.bars import without_bars
 from gavo_jax.datasets.base import TRACED, Frame, require_grey_levels, require_image
 from gavo_jax.errors import GavoError, shown
-from gavo_jax.image.numbers import as_array, with_zeros
+from gavo_jax.number_types import as_array, with_zeros
 
 
 class Images(NamedTuple):

@@ -25,8 +25,8 @@ from gavo_jax.datasets.own_camera import nearest_camera_file, preset_by_name
 from gavo_jax.datasets.registry import open_source, recognise, source_around
 from gavo_jax.errors import GavoError
 from gavo_jax.evaluation import rotation_angle
-from gavo_jax.image.numbers import Depth
 from gavo_jax.interrupts import interruptible
+from gavo_jax.number_types import Depth
 from gavo_jax.output.files import json_text
 from gavo_jax.output.screen import say, waiting
 from gavo_jax.settings_check import as_seed

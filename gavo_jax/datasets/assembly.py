@@ -16,7 +16,7 @@ from gavo_jax.datasets.base import Frame, FrameError
 from gavo_jax.datasets.images import to_8_bits, white_of, without_invalid
 from gavo_jax.datasets.registration import Registration
 from gavo_jax.errors import GavoError, GavoWarning
-from gavo_jax.image.numbers import NO_READING, Depth
+from gavo_jax.number_types import NO_READING, Depth
 
 FINE, COARSE = 5000.0, 1000.0
 """Units per metre of frames whose files hold floats; the finer one is used if its range suffices."""

@@ -12,7 +12,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.camera_check import require_camera
 from gavo_jax.camera_files.calibration import MOST_DELAY
 from gavo_jax.errors import GavoError, as_number
-from gavo_jax.image.numbers import Depth, is_real
+from gavo_jax.number_types import Depth, is_real
 from gavo_jax.trajectory import Trajectory
 
 

@@ -14,7 +14,7 @@ from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.base import Sequence as FrameSequence
 from gavo_jax.datasets.depth_unit import doubt_of_scale, fault_of_scale, first_depths, reader_of, unit_of_file
 from gavo_jax.datasets.images import without_invalid
-from gavo_jax.image.numbers import NO_READING
+from gavo_jax.number_types import NO_READING
 
 MIN_READINGS = 1000
 """Minimum number of readings, or of pairs of neighbouring readings, for a judgement."""

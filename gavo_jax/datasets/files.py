@@ -20,7 +20,7 @@ from gavo_jax.datasets.depth_unit import better_scale, sample_depth
 from gavo_jax.datasets.films import file_of, film_of, read_frame
 from gavo_jax.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, read_color, read_depth
 from gavo_jax.errors import GavoError, as_number
-from gavo_jax.image.numbers import Depth
+from gavo_jax.number_types import Depth
 from gavo_jax.trajectory import Trajectory
 
 SAMPLED = 3

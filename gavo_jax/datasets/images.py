@@ -18,7 +18,7 @@ from jaxtyping import Float, Shaped, UInt8, UInt16
 from gavo_jax.camera import MAX_SIDE
 from gavo_jax.datasets.base import FrameError
 from gavo_jax.datasets.quiet import without_lines, without_log, without_words_on
-from gavo_jax.image.numbers import NO_READING, Depth
+from gavo_jax.number_types import NO_READING, Depth
 
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2", ".avif")
 """Suffixes of colour images searched for in a folder; a file that is given by name may have any."""

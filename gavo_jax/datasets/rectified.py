@@ -11,7 +11,7 @@ from gavo_jax.camera import Camera
 from gavo_jax.datasets.bars import without_bars
 from gavo_jax.datasets.base import Frame, Sequence, require_image
 from gavo_jax.errors import GavoError
-from gavo_jax.image.numbers import as_array, as_depth
+from gavo_jax.number_types import as_array, as_depth
 from gavo_jax.trajectory import Trajectory
 
 

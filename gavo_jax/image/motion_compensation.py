@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
 from gavo_jax.camera import Camera, inverse_depth, to_ray
-from gavo_jax.image.numbers import Depth, grey_bytes, readings_like
 from gavo_jax.image.pyramid import EDGE_TOLERANCE
 from gavo_jax.image.shutter import row_time
+from gavo_jax.number_types import Depth, grey_bytes, readings_like
 
 HALVING = np.array([1.0, 3.0, 3.0, 1.0]) / 8.0
 """Weights, along either axis, of the pixels that are averaged, as in `pyramid.halve_grey`."""

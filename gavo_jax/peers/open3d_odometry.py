@@ -6,8 +6,8 @@ import numpy as np
 
 from gavo_jax.camera import Camera
 from gavo_jax.datasets.base import Frame
-from gavo_jax.image.numbers import grey_bytes
 from gavo_jax.libusb import import_open3d
+from gavo_jax.number_types import grey_bytes
 from gavo_jax.peers.base import PeerResult, check_size, failure, result_of
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from gavo_jax.camera import Camera, in_image
 from gavo_jax.datasets.base import Frame
-from gavo_jax.image.numbers import grey_bytes
+from gavo_jax.number_types import grey_bytes
 from gavo_jax.viewer.colors import RESIDUAL_COLORS, color_of_body
 
 IMAGE_WIDTH = 320

@@ -9,7 +9,7 @@ from small import CAMERA, NEWTON, Rendered
 
 from gavo_jax.alignment.pairs import align
 from gavo_jax.datasets.rectified import rectified
-from gavo_jax.image.numbers import as_depth
+from gavo_jax.number_types import as_depth
 
 FRAMES = [Rendered(4, camera=CAMERA)[i] for i in (0, 3)]
 MARKED = [replace(frame, depth=np.where(np.arange(160) < 60, 65535, frame.depth)) for frame in FRAMES]

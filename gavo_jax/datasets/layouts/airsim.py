@@ -18,7 +18,7 @@ from gavo_jax.datasets.layouts.plain_folder import PlainFolder
 from gavo_jax.datasets.own_camera import nearest_camera_file
 from gavo_jax.datasets.truth import Seconds
 from gavo_jax.errors import GavoError, read_text
-from gavo_jax.image.numbers import Depth
+from gavo_jax.number_types import Depth
 from gavo_jax.trajectory import Trajectory
 
 RECORDING = "airsim_rec.txt"

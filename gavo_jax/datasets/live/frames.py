@@ -13,7 +13,7 @@ from gavo_jax.camera_check import require_camera
 from gavo_jax.datasets.base import Frame
 from gavo_jax.datasets.images import without_invalid
 from gavo_jax.errors import GavoError
-from gavo_jax.image.numbers import as_array
+from gavo_jax.number_types import as_array
 
 
 class LiveImages(NamedTuple):
