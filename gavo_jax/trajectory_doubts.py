@@ -94,7 +94,7 @@ def other_axes(trajectory: Trajectory, other: Trajectory) -> str | None:
     except GavoError:
         return None
     limits = zip(turned, as_written, (FAR, LARGE), strict=True)
-    is_told = all(after < max(REORDERED * before, least) for after, before, least in limits)
+    is_told = all(after < (REORDERED * before if before > least else least) for after, before, least in limits)
     angle = float(rotation_angle(rotation))
     return _axes(rotation, angle) if is_told and angle > TURNED else None
 

@@ -85,7 +85,7 @@ def run(options: Run) -> int:
         metrics, interrupted = folder.finished() if options.resume else None, False
         if metrics is not None:
             shown = "" if options.viewer == "none" else f"; gavo view {folder.path} shows it"
-            print_message(f"{folder.path}: the run {_end(metrics, folder)}: nothing to resume{shown}")
+            print_message(f"{folder.path}: the run {_end(metrics, folder, settings)}: nothing to resume{shown}")
             _draw_if_missing(options, sequence, folder)
         else:
             # before an earlier run is replaced, as opening may fail
@@ -117,7 +117,7 @@ def run(options: Run) -> int:
     return LOST if options.strict and metrics["lost_pairs"] else 0
 
 
-def _end(metrics: dict[str, Any], folder: RunFolder) -> str:
+def _end(metrics: dict[str, Any], folder: RunFolder, settings: Settings) -> str:
     """Say how an earlier run without a checkpoint ended.
 
     Raises:
@@ -125,7 +125,7 @@ def _end(metrics: dict[str, Any], folder: RunFolder) -> str:
     """
     if metrics.get("complete", True):
         return "is already complete"
-    if metrics.get("lost_pairs"):
+    if metrics.get("lost_pairs") and settings.odometry.on_lost == "stop":
         return "ended at its first lost pair"
     raise GavoError(f"{folder.path}: the run was interrupted, and its checkpoint is gone: run again without --resume")
 
