@@ -70,11 +70,17 @@ def report_held(folder: Path, markdown: bool) -> int:
     rows.sort(key=lambda row: (order.get((row["sequence"], row["label"]), len(order)), row["seed"] or 0))
     others = [row for row in rows if record.runs and row["run"] not in record.runs]
     earlier = {row["sequence"] for row in others} - {row["sequence"] for row in rows if row["run"] in record.runs}
-    summaries, comparisons = summarise(rows), compare(rows, earlier)
+    missing = len(record.runs - {row["run"] for row in rows})
+    summaries, comparisons = summarise(rows), [] if missing else compare(rows, earlier)
     tables = [*_summary_tables(summaries, record), *_comparison_tables(comparisons)]
     for table in tables:
         table.show(markdown)
     notes = _notes(rows, others, summaries)
+    if missing:
+        notes.append(
+            f"{missing} of the {len(record.runs)} planned runs are not done, so methods are not compared yet; gavo "
+            "experiment FILE does them."
+        )
     columns = {heading for table in tables for heading in table.columns}
     for line in (*(words for heading, words in MEANINGS.items() if heading in columns), *notes):
         say(line)

@@ -209,7 +209,7 @@ def _variants(place: str, entry: Mapping[str, Any], default_seeds: tuple[int, ..
     for name, values in swept.items():
         if not isinstance(values, list) or not values:
             raise GavoError(f"{place}: sweep.{one_line(name)}: not a list of values")
-        if name in fixed:
+        if any(other == name or other.startswith(f"{name}.") for other in fixed):
             raise GavoError(f"{place}: sweep.{one_line(name)}: has a fixed value, too")
     variants = []
     for preset in names:

@@ -69,8 +69,9 @@ def run_experiment(
         on_outcome: Called with each batch's outcome once its rows are in the table.
 
     Raises:
-        GavoError: The table cannot be written.
+        GavoError: The table cannot be written, or pyarrow is missing.
     """
+    table.require_library()
     todo = fitted_batches(missing(plan, table), plan.batch, executor.slots())
     rows, faults = 0, []
     for outcome in executor.run(plan.name, todo, on_pairs):

@@ -69,7 +69,7 @@ def _summary(sequence: str, label: str, rows: Sequence[Row]) -> Summary:
         len(rows),
         None if quartiles is None else (quartiles[0], quartiles[1], quartiles[2]),
         sum(drift < np.inf for drift in drifts),
-        float(np.median(turns)) if quartiles else None,
+        quantiles_of(turns, (0.5,))[0] if quartiles else None,
         float(np.median(steps)) if steps else None,
         max(row["lost_pairs"] for row in rows),
         float(np.median([1e3 / row[FRAMES_PER_SECOND] for row in rows])),
@@ -80,8 +80,9 @@ def _summary(sequence: str, label: str, rows: Sequence[Row]) -> Summary:
 def compare(rows: Sequence[Row], earlier: Collection[str] = ()) -> list[Comparison]:
     """Compare every two labels on each sequence, and over all sequences if there are several.
 
-    A method that ran only once on a sequence is compared with every seed of the other. A single pair is not compared.
-    A run without a drift, of a camera that was lost, is worse than any with one.
+    A method with a single result on a sequence, as one without chance has it for every seed, is compared with every
+    seed of the other; two such methods make a single pair. A single pair is not compared. A run without a drift, of a
+    camera that was lost, is worse than any with one.
 
     Args:
         rows: Rows in which a sequence's name always stands for the same frames, and a label for the same settings.
@@ -96,17 +97,19 @@ def compare(rows: Sequence[Row], earlier: Collection[str] = ()) -> list[Comparis
     found = []
     for first, second in itertools.combinations(drifts, 2):
         matched = {name: _matched(drifts[first].get(name, {}), drifts[second].get(name, {})) for name in sequences}
-        if len(sequences) - len(earlier) > 1:
-            matched[ALL] = list(itertools.chain(*(pairs for name, pairs in matched.items() if name not in earlier)))
+        present = [pairs for name, pairs in matched.items() if pairs and name not in earlier]
+        if len(present) > 1:
+            matched[ALL] = list(itertools.chain(*present))
         found += [_test(name, first, second, pairs) for name, pairs in matched.items() if len(pairs) > 1]
     return sorted(found, key=lambda comparison: [*sequences, ALL].index(comparison.sequence))
 
 
 def _matched(first: Mapping[Any, float], second: Mapping[Any, float]) -> list[tuple[float, float]]:
-    if len(first) == 1:
-        pairs = [(next(iter(first.values())), value) for value in second.values()]
-    elif len(second) == 1:
-        pairs = [(value, next(iter(second.values()))) for value in first.values()]
+    one, other = set(first.values()), set(second.values())
+    if len(one) == 1:
+        pairs = [(*one, value) for value in (other if len(other) == 1 else second.values())]
+    elif len(other) == 1:
+        pairs = [(value, *other) for value in first.values()]
     else:
         pairs = [(first[seed], second[seed]) for seed in first if seed in second]
     return [pair for pair in pairs if min(pair) < np.inf]

@@ -63,6 +63,14 @@ class Table:
         files = (path for path in self.folder.glob(f"*{SUFFIX}") if not path.name.startswith("."))
         return {path.stem for path in files if path.stat().st_size}
 
+    def require_library(self) -> None:
+        """Check that rows can be read and written, before anything runs.
+
+        Raises:
+            GavoError: pyarrow is missing.
+        """
+        _parquet()
+
     def append(self, row: Mapping[str, Any]) -> None:
         """Add a row atomically, replacing any row of the same run.
 

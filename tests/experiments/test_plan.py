@@ -174,6 +174,11 @@ REFUSED = {
         METHOD + "solver.pressure = 8\nsweep.solver.pressure = [4]",
         ["pressure", "a fixed value, too"],
     ),
+    "a fixed entry of a swept schedule": (
+        "",
+        METHOD + "solver.population.4 = 48\nsweep.solver.population = [[16, 16, 16, 16, 16]]",
+        ["population", "a fixed value, too"],
+    ),
     "name of another folder": ('name = "../../x"', METHOD, ["name", "'../../x'", "cannot be a path"]),
     "name of the folder above": ('name = ".."', METHOD, ["name", "'..'", "cannot be a path"]),
     "no path": ("[[sequences]]\npath = []\n", METHOD, ["path: an empty list"]),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from gavo_jax.cli.experiment_report import _ended, _without_drift
+from gavo_jax.cli.experiment_report import _comparison_tables, _ended, _without_drift
 from gavo_jax.experiments.summary import ALL, compare, summarise
 
 
@@ -83,6 +83,27 @@ def test_a_clear_difference_is_significant_and_none_is_not():
     assert same.p is None and same.ratio == 1.0
 
 
+def test_seeds_of_a_method_without_chance_are_one_result() -> None:
+    """Twenty equal drifts against one of another such method were twenty pairs, with a p of 8e-6."""
+    table = rows("a", "newton", [0.1] * 20) + rows("a", "peer", [0.3], [None])
+    assert compare(table) == []
+    (found,) = compare(table + rows("b", "newton", [0.2] * 20) + rows("b", "peer", [0.8], [None]))
+    assert (found.sequence, found.pairs, found.ratio) == (ALL, 2, pytest.approx(7 / 24))
+    (found,) = compare(table + rows("a", "ga", [0.2, 0.3, 0.4]))[:1]
+    assert (found.first, found.second, found.pairs, found.ratio) == ("newton", "ga", 3, pytest.approx(1 / 3))
+
+
+def test_rotation_of_runs_that_got_lost_counts_as_infinite_too() -> None:
+    (found,) = summarise(rows("a", "x", [0.01, 0.02, 0.03, None]))
+    assert found.drift is not None and (found.drift[1], found.rotation) == (0.03, 3.0)
+
+
+def test_a_sequence_on_which_no_methods_meet_is_no_second_one() -> None:
+    """Catches a line over all sequences that repeats the only one that both methods ran on."""
+    table = rows("a", "x", [0.1, 0.2]) + rows("a", "y", [0.2, 0.4]) + rows("b", "x", [0.1, 0.3])
+    assert [found.sequence for found in compare(table)] == ["a"]
+
+
 def test_pairs_are_matched_by_seed_and_over_sequences():
     table = rows("a", "x", [0.1, 0.2], [0, 1]) + rows("a", "y", [0.1, 0.3], [1, 2])
     table += rows("b", "x", [0.4, 0.2], [0, 1]) + rows("b", "y", [0.1], [None])
@@ -96,6 +117,13 @@ def test_a_pair_of_runs_that_both_got_lost_says_nothing() -> None:
     """Catches a ratio of infinities, which is not a number; and a single tie that takes the test away."""
     (found,) = compare(rows("a", "x", [0.1, None, 0.3, 0.2]) + rows("a", "y", [0.1, None, 0.6, 0.4]))
     assert found.pairs == 3 and found.ratio == 0.5 and found.p is not None
+
+
+def test_a_comparison_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    (found,) = compare(rows("a", "x", [0.1, 0.2, 0.3]) + rows("a", "y", [0.2, 0.4, 0.6]))
+    (table,) = _comparison_tables([found])
+    table.show(markdown=True)
+    assert "| x / y | 3 | 0.5000 | 0.25 |" in capsys.readouterr().out and "Wilcoxon" in table.caption
 
 
 def test_sequences_of_earlier_versions_are_not_compared_over_all() -> None:
