@@ -35,6 +35,7 @@ from gavo_jax.datasets.base import Sequence
 from gavo_jax.datasets.depth_unit import COMMON, KINECT_VIEW, sample_sequence
 from gavo_jax.datasets.rectified import without_distortion
 from gavo_jax.errors import GavoError
+from gavo_jax.odometry.plausibility import image_shift
 
 Wanted = Literal["readout", "depth_delay", "depth_scale", "vignetting", "focal_length", "principal_point"]
 ALWAYS: tuple[Wanted, ...] = ("readout", "depth_delay", "depth_scale", "vignetting")
@@ -58,6 +59,10 @@ ROUNDS = 2
 
 TOO_UNSURE = {"readout": 0.005, "depth_delay": 0.005, "focal_length": 0.03, "principal_point": 6.0, "vignetting": 0.1}
 """Standard deviation from which a parameter counts as undetermined: seconds, seconds, share, pixels, 1."""
+
+LEAST_SHIFT = 0.2
+"""Pixels that the image has to move in the time by which a delay may be off (`TOO_UNSURE`). If it moves less, what the
+delay seems to be is due to noise."""
 
 SHARED = {"readout": 0.002, "depth_delay": 0.002, "focal_length": 0.01, "principal_point": 2.0, "vignetting": 0.03}
 """Deviation common to all pairs, which their scatter doesn't show: the error on rendered frames of a known camera.
@@ -123,6 +128,12 @@ class _Trial:
         """Estimate the camera's motion again, with the current parameters."""
         matched = self.match(self.unknowns)
         self.kinematics = [Kinematics.of(stamps, m) for stamps, m in zip(self.stamps, matched, strict=True)]
+
+    def image_speed(self) -> float:
+        """Return how fast the camera's motion moves the image, pixels per second, root mean square."""
+        twists = np.concatenate([np.asarray(moving.velocity) for moving in self.kinematics])
+        length, angle = (np.linalg.norm(part, axis=1) for part in (twists[:, :3], twists[:, 3:]))
+        return float(self.unknowns.fx) * float(np.sqrt(np.mean(np.square(image_shift(length, angle)))))
 
     def apart(self, frames: int) -> "_Trial":
         """Split each stretch, without its ends, into `frames` ones that take every `frames`-th frame."""
@@ -310,8 +321,11 @@ def _judged(minima: dict[str, Minimum], trial: _Trial, interval: float, guessed:
         guessed: Origin of the stamps if they are a guess; else empty.
     """
     found = {}
+    speed = trial.image_speed()
     for name, least in minima.items():
         kind, unit, how = _KINDS[name]
+        if unit == "s" and speed * TOO_UNSURE[kind] < LEAST_SHIFT:
+            least = least._replace(deviation=np.inf)
         if name == "readout" and least.value >= interval:
             how += "; this is the longest possible, the time between two frames"
         if unit == "s" and guessed:

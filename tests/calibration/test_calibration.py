@@ -129,6 +129,24 @@ def test_the_estimates_camera_is_of_the_frames_as_given() -> None:
     np.testing.assert_allclose(vignetting_gain(found), gain, rtol=1e-5)
 
 
+@pytest.mark.parametrize("noise", [0.0, 2.0])
+def test_a_camera_at_rest_determines_no_time(noise: float) -> None:
+    """Of copies of one frame, depth came out 10 ms early, to within 2 ms."""
+    standing, rng = Shaken(), np.random.default_rng(0)
+    first = standing[0]
+    standing.frames = [
+        replace(
+            first,
+            timestamp=stamp,
+            grey=np.clip(first.grey + rng.normal(0, noise, first.grey.shape), 0, 255).astype(np.uint8),
+            depth=(first.depth * (1 + 0.0015 * noise * rng.normal(size=first.depth.shape))).astype(np.uint16),
+        )
+        for stamp in standing.timestamps
+    ]
+    found = estimate_camera(standing, ("readout", "depth_delay"), rounds=1).found  # pyright: ignore
+    assert found["readout"].value is None and found["depth_delay"].value is None
+
+
 def test_depth_of_another_clock_has_no_delay() -> None:
     """Stamps 1000 s off, which a run takes for those of another clock, left no pair that could be aligned."""
     shaken = Shaken(4)
