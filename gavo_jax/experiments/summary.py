@@ -106,10 +106,12 @@ def compare(rows: Sequence[Row], earlier: Collection[str] = ()) -> list[Comparis
 
 def _matched(first: Mapping[Any, float], second: Mapping[Any, float]) -> list[tuple[float, float]]:
     one, other = set(first.values()), set(second.values())
-    if len(one) == 1:
-        pairs = [(*one, value) for value in (other if len(other) == 1 else second.values())]
+    if len(one) == len(other) == 1:
+        pairs = list(zip(one, other, strict=True))
+    elif len(one) == 1:
+        pairs = list(itertools.product(one, second.values()))
     elif len(other) == 1:
-        pairs = [(value, *other) for value in first.values()]
+        pairs = list(itertools.product(first.values(), other))
     else:
         pairs = [(first[seed], second[seed]) for seed in first if seed in second]
     return [pair for pair in pairs if min(pair) < np.inf]
