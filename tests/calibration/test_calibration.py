@@ -162,7 +162,7 @@ def test_a_readout_is_no_longer_than_the_time_between_two_frames() -> None:
         del kind, change
         return lambda value: (1.0 + (value - 0.037) ** 2 * np.ones(20), np.ones(20, bool))
 
-    trial: Any = SimpleNamespace(score=score, unknowns=Unknowns.of(CAMERA))
+    trial: Any = SimpleNamespace(score=score, unknowns=Unknowns.of(CAMERA), image_speed=lambda: 300.0)
     leasts = estimate_module._find_readout(trial, 1 / 30, True)
     assert leasts["readout"].value == trial.unknowns.readout == 1 / 30
     found = estimate_module._judged(leasts, trial, 1 / 30, "names are numbers")["readout"]
