@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gavo_jax.calibration.darkness import darkness_of
+from gavo_jax.camera import Camera
 from gavo_jax.cli.map_file import check_map_options, save_map
 from gavo_jax.cli.options import Run
 from gavo_jax.cli.readiness import be_ready
@@ -50,6 +51,8 @@ from gavo_jax.trajectory_doubts import is_inverse, is_w_first, other_axes, relat
 from gavo_jax.viewer.base import Viewer
 from gavo_jax.viewer.live import make_viewer
 
+MANY_FLAGGED = 0.2
+"""Share of pairs that are `moving_body` above which the rolling shutter may be the reason."""
 CHECKPOINT_SECONDS = 2.0
 """Seconds between two checkpoints; writing one takes about 20 ms."""
 
@@ -106,7 +109,8 @@ def run(options: Run) -> int:
         write_trajectories(trajectory, folder.path, trajectory_formats)
         if options.map is not None:
             save_map(options.map, sequence, folder, trajectory, shape, options.voxel)
-    for line in _doubts(trajectory, truth, unit_of_file(sequence)) if truth is not None else ():
+    doubts = [] if truth is None else list(_doubts(trajectory, truth, unit_of_file(sequence)))
+    for line in (*doubts, *(() if is_rendered else _doubts_about_shutter(sequence.camera, metrics))):
         say(line)
     if not (interrupted or is_rendered) and (dark := darkness_of(sequence, trajectory)) is not None and dark.is_harmful:
         darker = f"The images' corners are {100 * dark.share:.0f} % darker than their middle"
@@ -162,6 +166,16 @@ def _doubts(trajectory: Trajectory, truth: Trajectory, units: float) -> Iterator
         if name := unit_of_length(1 / size):
             cause = f"The ground truth seems to be in {name}; write it in metres."
         yield f"The trajectory has {size:.3g} times the size of the ground truth. {cause}"
+
+
+def _doubts_about_shutter(camera: Camera, metrics: dict[str, Any]) -> Iterator[str]:
+    """Yield a line if a rolling shutter that the camera does not state may be taken for moving bodies."""
+    flagged = metrics.get("statuses", {}).get("moving_body", 0)
+    if not camera.readout and flagged > MANY_FLAGGED * metrics.get("pairs", 0):
+        yield (
+            "The camera file states no readout, and an unknown rolling shutter makes a scene look as if it moved. gavo "
+            "calibrate finds the readout."
+        )
 
 
 def _start(options: Run, sequence: Sequence, folder: RunFolder, config: dict[str, Any]) -> None:
